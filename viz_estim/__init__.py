@@ -1,0 +1,47 @@
+"""The debugger for state estimators: every step, stage by stage, in a recording that can be scrubbed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from viz_estim.recording.reader import Run
+
+__all__ = ["estimate_rot", "load"]
+
+
+def load(path: str | Path) -> Run:
+    """A recording as arrays: see `viz_estim.recording.reader.Run`."""
+    from viz_estim.recording.reader import load as read
+
+    return read(path)
+
+
+def estimate_rot(
+    imu_file: str | Path, *, calibration: str | Path | None = None, **params: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Roll, pitch and yaw (T,) in radians of an IMU file, by `imu-ukf`; R = Rz(yaw)·Ry(pitch)·Rx(roll).
+
+    params are the scenario's own (`gyro_noise=…`, `frozen="reject"`, the default here). Raises ArithmeticError with
+    the step where the filter failed.
+    """
+    from viz_estim.core import quaternions
+    from viz_estim.core.run import run
+    from viz_estim.scenarios import imu
+
+    data = imu.prepare(
+        imu.imu_files.load(Path(imu_file), None), Path(calibration) if calibration is not None else None
+    )
+    scenario = imu.imu_ukf(data, **({"frozen": "reject"} | params))
+    import numpy as np
+
+    attitudes = []
+    for step in run(scenario):
+        if step.error:
+            raise ArithmeticError(f"{imu_file}: step {step.index}, stage {step.error.stage}: {step.error.message}")
+        attitudes.append(step.stages[-1].belief.mean[:4])
+    roll, pitch, yaw = quaternions.to_euler(np.stack(attitudes)).T
+    return roll, pitch, yaw

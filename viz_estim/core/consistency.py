@@ -1,0 +1,183 @@
+"""How good an estimate is, and whether it knows: errors, NEES, NIS, and their bands.
+
+Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and Navigation* (2001), section 5.4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from viz_estim.core import quaternions
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import SO3, Product, Space
+
+_LEVEL = 0.95
+
+
+def squared_distance(error: Array, cov: Array) -> Array:
+    """eᵀ·P⁻¹·e (*,) of e (*, d) and P (*, d, d): NIS of a residual under S, NEES of an error under P."""
+    return (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(-1)
+
+
+def band(dof: int, count: int = 1, level: float = _LEVEL) -> tuple[float, float]:
+    """The two-sided band of the mean of `count` independent χ²(dof): (low, high).
+
+    For NIS, count is the number of updates in time (innovations are white); for NEES, the number of runs at one
+    step (errors are not white, so that their mean over time has no such band).
+    """
+    tail = 0.5 * (1 - level)
+    low, high = chi2.ppf([tail, 1 - tail], dof * count) / count
+    return float(low), float(high)
+
+
+def rms(error: Array) -> float:
+    """Root of the mean squared length of errors (T, d)."""
+    return float(np.sqrt((error * error).sum(-1).mean()))
+
+
+def metrics(space: Space, mean: Array, truth: Array) -> dict[str, float]:
+    """Errors by part of the state, over the steps whose truth is known; names carry their units.
+
+    mean, truth (T, n). Attitudes: the geodesic angle, roll, pitch and yaw beside it, and the tilt (the angle between
+    the estimated and the true direction of gravity).
+    """
+    parts = space.parts if isinstance(space, Product) else {"state": space}
+    at = space.at if isinstance(space, Product) else {"state": slice(0, len(space.names))}
+    found: dict[str, float] = {}
+    for name, part in parts.items():
+        x, y = mean[:, at[name]], truth[:, at[name]]
+        known = np.isfinite(y).all(1) & np.isfinite(x).all(1)
+        if known.any():
+            found |= _attitude(x[known], y[known]) if isinstance(part, SO3) else _plain(name, part, x[known], y[known])
+    return found
+
+
+def _attitude(x: Array, y: Array) -> dict[str, float]:
+    relative = quaternions.multiply(quaternions.conjugate(y), x)
+    angle = rms(quaternions.log(relative))
+    turns = quaternions.to_euler(x) - quaternions.to_euler(y)
+    roll, pitch, yaw = np.sqrt((((turns + np.pi) % (2 * np.pi) - np.pi) ** 2).mean(0))
+    up = np.array([0.0, 0.0, 1.0])
+    up_x, up_y = (quaternions.rotate(quaternions.conjugate(q), up) for q in (x, y))
+    tilt = np.arctan2(np.linalg.norm(np.cross(up_x, up_y), axis=-1), (up_x * up_y).sum(-1))
+    values = {"attitude": angle, "roll": roll, "pitch": pitch, "yaw": yaw, "tilt": float(np.sqrt((tilt**2).mean()))}
+    return {f"{name}_rmse_deg": float(np.degrees(value)) for name, value in values.items()}
+
+
+_UNIT_NAMES = {"m": "m", "rad": "rad", "m/s": "mps", "rad/s": "radps", "m/s²": "mps2"}
+
+
+def _plain(name: str, part: Space, x: Array, y: Array) -> dict[str, float]:
+    unit = _UNIT_NAMES.get(part.axis_units[0], part.axis_units[0])
+    return {f"{name}_rmse_{unit}" if unit else f"{name}_rmse": rms(part.minus(x, y))}
+
+
+@dataclass(frozen=True)
+class Nis:
+    """Normalised innovation squared of one sensor: values (T,), NaN where it was not offered."""
+
+    values: Array
+    dof: int
+
+    def summary(self) -> dict[str, float] | None:
+        """The mean, and the 95 % band of that mean over time; None where nothing was offered."""
+        offered = self.values[np.isfinite(self.values)]
+        if not len(offered):
+            return None
+        low, high = band(self.dof, len(offered))
+        return {"mean": float(offered.mean()), "dof": self.dof, "low": low, "high": high}
+
+
+def nis(space: Product, residual: Array, cov: Array, offered: np.ndarray) -> dict[str, Nis]:
+    """NIS by sensor, each by its own block of S: residual (T, m), cov (T, m, m), offered (T, s)."""
+    found = {}
+    for i, name in enumerate(space.parts):
+        at = space.axes_at[name]
+        values = squared_distance(residual[:, at], cov[:, at, at])
+        found[name] = Nis(np.where(offered[:, i], values, np.nan), at.stop - at.start)
+    return found
+
+
+def nees(space: Space, mean: Array, cov: Array, truth: Array) -> tuple[Array, int]:
+    """Normalised estimation error squared (T,) over the parts of the state that have a truth, and its χ² dof.
+
+    NaN at steps without truth, or where the covariance of those parts is singular.
+    """
+    error = space.minus(mean, truth)
+    known = np.isfinite(error)
+    directions = np.flatnonzero(known.any(0))
+    values = np.full(len(mean), np.nan)
+    rows = known[:, directions].all(1)
+    if len(directions) == 0 or not rows.any():
+        return values, len(directions)
+    P = cov[np.ix_(np.flatnonzero(rows), directions, directions)]
+    sound = np.linalg.cond(P) < 1e15
+    at = np.flatnonzero(rows)[sound]
+    values[at] = squared_distance(error[at][:, directions], P[sound])
+    return values, len(directions)
+
+
+def nees_summary(values: Array, dof: int) -> dict[str, float] | None:
+    """The mean NEES, and the share of steps inside χ²(dof)'s two-sided 95 % interval; None without truth."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return None
+    low, high = band(dof)
+    return {"mean": float(known.mean()), "dof": dof, "inside": float(((known >= low) & (known <= high)).mean())}
+
+
+def summary(
+    space: Space, mean: Array, cov: Array, truth: Array, innovations: list[tuple[Product, Array, Array, np.ndarray]]
+) -> dict[str, Any]:
+    """`metrics`, `nis` by sensor, and `nees` of a run, as the command line prints them.
+
+    mean, truth (T, n) and cov (T, d, d) at the end of each step that counts; innovations: of each update stage its
+    measurement's space, residuals (M, m), S (M, m, m) and which were offered (M, s).
+    """
+    if not len(mean):
+        return {"metrics": {}, "nis": {}, "nees": None}
+    by_sensor = {name: found.summary() for rows in innovations for name, found in nis(*rows).items()}
+    return {
+        "metrics": metrics(space, mean, truth),
+        "nis": {name: values for name, values in by_sensor.items() if values},
+        "nees": nees_summary(*nees(space, mean, cov, truth)),
+    }
+
+
+class Tally:
+    """Gathers of each step what a run's summary needs, and nothing large: clouds and sigma points are let go.
+
+    first: the first step that counts.
+    """
+
+    def __init__(self, space: Space, first: int) -> None:
+        self.space, self.first = space, first
+        self.means: list[Array] = []
+        self.covs: list[Array] = []
+        self.truths: list[Array] = []
+        self.innovations: dict[str, list[Any]] = {}
+
+    def add(self, step: Any) -> None:
+        """Takes in a `Step`, unless it lies before the first that counts or never came to its end."""
+        if step.index < self.first or not step.stages or step.error:
+            return
+        belief = step.stages[-1].belief
+        self.means.append(belief.mean)
+        self.covs.append(belief.cov)
+        self.truths.append(np.full(len(belief.mean), np.nan) if step.truth is None else step.truth)
+        for stage in step.stages:
+            if hasattr(stage, "innovation"):
+                self.innovations.setdefault(stage.name, []).append(stage.innovation)
+
+    def summary(self) -> dict[str, Any]:
+        """The run's `summary`."""
+        innovations = [
+            (rows[0].space, *(np.stack([getattr(row, k) for row in rows]) for k in ("residual", "cov", "offered")))
+            for rows in self.innovations.values()
+        ]
+        stacked = [np.stack(values) if values else np.empty(0) for values in (self.means, self.covs, self.truths)]
+        return summary(self.space, *stacked, innovations)

@@ -1,0 +1,149 @@
+"""The loop: ticks in, steps out. A numerical failure is a step's data, not an exception."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from viz_estim.core.beliefs import Belief
+from viz_estim.core.quaternions import Array
+from viz_estim.core.stages import Stage, Start
+
+
+class StandIn(NamedTuple):
+    """What an estimator reads in place of a sensor that is known to be wrong: z (n,) with noise (m, m)."""
+
+    z: Array
+    noise: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """All that an estimator may see of one moment; never the truth.
+
+    time (s), dt (s) since the tick before (0: no prediction is due), control (c,), the sensors' readings by name and
+    the raw numbers they came from; faults: what is known to be wrong with a sensor ("frozen"); stand_ins: what to
+    read instead. Readings may carry leading batch axes.
+    """
+
+    time: float
+    dt: float
+    control: Array | None = None
+    measurements: Mapping[str, Array] = field(default_factory=dict)
+    raw: Mapping[str, Array] = field(default_factory=dict)
+    faults: Mapping[str, str] = field(default_factory=dict)
+    stand_ins: Mapping[str, StandIn] = field(default_factory=dict)
+
+
+class Estimator(Protocol):
+    """Turns a belief and a tick into the stages of a step; the belief is all that it carries on."""
+
+    def step(self, belief: Belief, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]: ...
+
+
+class NotFinite(ArithmeticError):
+    """A stage's belief holds NaN or infinity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """What ended a run: at which step, in which stage, and the exception's text."""
+
+    step: int
+    stage: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What is recorded of one moment: the tick, the stages in order, the truth (n,) or None, the failure if any."""
+
+    index: int
+    tick: Tick
+    stages: tuple[Stage, ...]
+    truth: Array | None = None
+    error: Failure | None = None
+
+
+@dataclass(frozen=True)
+class Box:
+    """The estimated body as a box: sizes (x, y, z) in metres along its body axes."""
+
+    sizes: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """An estimator over data.
+
+    beliefs: by step, the belief that is set there; step 0 must have one. The steps before the last one count in no
+    metric. truth (T, n), NaN where it is absent, or None. scenery: what else stands in the scene. notes: what to look
+    at, as markdown.
+    """
+
+    estimator: Estimator
+    beliefs: Mapping[int, Belief]
+    ticks: Sequence[Tick]
+    truth: Array | None = None
+    scenery: Mapping[str, Box] = field(default_factory=dict)
+    notes: str = ""
+
+    @property
+    def space(self) -> Any:
+        return self.beliefs[0].space
+
+
+class Chance:
+    """The generator of each step, Philox with the key (seed, step), so that a step can be done again alone."""
+
+    def __init__(self, seed: int) -> None:
+        self._bits = np.random.Philox(key=np.array([seed, 0], dtype=np.uint64))
+        self._generator = np.random.Generator(self._bits)
+        self._state = self._bits.state
+
+    def at(self, step: int) -> np.random.Generator:
+        """The step's generator, valid until the next call: resetting one is ten times as fast as making one."""
+        self._state["state"]["key"][1] = step
+        self._bits.state = self._state
+        return self._generator
+
+
+def run(scenario: Scenario, seed: int = 0) -> Iterator[Step]:
+    """The scenario's steps, one a tick; the last one carries a failure where the estimator raised one."""
+    belief: Belief | None = None
+    chance = Chance(seed)
+    usual: tuple[str, ...] = ()
+    for k, tick in enumerate(scenario.ticks):
+        stages: list[Stage] = []
+        error = None
+        if k in scenario.beliefs:
+            belief = scenario.beliefs[k]
+            stages.append(Start("start", belief))
+        assert belief is not None, "a scenario sets a belief at step 0"
+        try:
+            for stage in scenario.estimator.step(belief, tick, chance.at(k)):
+                stages.append(stage)
+                belief = stage.belief
+                if not (np.isfinite(belief.mean).all() and np.isfinite(belief.cov).all()):
+                    raise NotFinite("the belief is no longer finite")
+        except Exception as failure:  # whatever a person's filter raises is what they came to see
+            text = f"{type(failure).__name__}: {failure}"
+            error = Failure(k, _failing_stage(stages, usual, failure), text)
+        usual = tuple(stage.name for stage in stages if not isinstance(stage, Start))
+        truth = None if scenario.truth is None else scenario.truth[k]
+        yield Step(k, tick, tuple(stages), truth, error)
+        if error:
+            return
+
+
+def _failing_stage(stages: list[Stage], usual: tuple[str, ...], failure: Exception) -> str:
+    """The stage that did not come: the next in the usual order, or the last one where its belief was refused."""
+    done = [stage.name for stage in stages if not isinstance(stage, Start)]
+    if isinstance(failure, NotFinite):
+        return done[-1]
+    if list(usual[: len(done)]) == done and len(usual) > len(done):
+        return usual[len(done)]
+    return f"after {done[-1]}" if done else "first"

@@ -1,0 +1,91 @@
+"""The records of a step. A stage is frozen and carries the belief *after* it, with what led there.
+
+What a stage holds is named by its fields and understood by their types: the recorder turns a `SigmaPoints` into points,
+an `Innovation` into plots and NIS, an array into numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from viz_estim.core.beliefs import Belief
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import Product, Space
+
+
+@dataclass(frozen=True, slots=True)
+class SigmaPoints:
+    """Weighted points (*, N, n) of a space; the weights (N,) are for the mean and for the covariance."""
+
+    space: Space
+    points: Array
+    mean_weights: Array
+    cov_weights: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Innovation:
+    """What a measurement said against what was expected. `space` is a product with one part a sensor.
+
+    With n numbers and m directions of the measurement's space, d directions of the state and s sensors:
+    z, predicted (*, n); residual = z ⊟ predicted (*, m); cov S, noise R (*, m, m); cross_cov (*, d, m);
+    used (*, s): False where a gate refused the sensor's part; offered (*, s): False where the part is no reading of
+    the sensor (a stand-in while it is frozen), so that NIS must not count it;
+    blind (*, d, s): a unit direction of the state that the sensor cannot see, zero where there is none.
+    """
+
+    space: Product
+    z: Array
+    predicted: Array
+    residual: Array
+    cov: Array
+    noise: Array
+    cross_cov: Array
+    used: NDArray[np.bool_]
+    offered: NDArray[np.bool_]
+    blind: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One stage of a step: its name, and the belief after it."""
+
+    name: str
+    belief: Belief
+
+
+@dataclass(frozen=True, slots=True)
+class Start(Stage):
+    """The belief is set rather than estimated: at step 0, and where a scenario says so."""
+
+
+@dataclass(frozen=True, slots=True)
+class Predict(Stage):
+    """The belief moved on by the process model."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnscentedPredict(Predict):
+    """A prediction through sigma points: as drawn, and as the process moved them."""
+
+    drawn: SigmaPoints
+    propagated: SigmaPoints
+
+
+@dataclass(frozen=True, slots=True)
+class Update(Stage):
+    """A measurement taken in: Δ = gain·residual moved the mean; gain (*, d, m) is zero where a sensor was gated."""
+
+    innovation: Innovation
+    gain: Array
+
+
+@dataclass(frozen=True, slots=True)
+class UnscentedUpdate(Update):
+    """An update through sigma points: in the state's space, and mapped into the measurement's."""
+
+    sigma: SigmaPoints
+    mapped: SigmaPoints

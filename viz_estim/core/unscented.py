@@ -1,0 +1,254 @@
+"""The unscented Kalman filter on any space: sigma points, prediction, update.
+
+One filter for every geometry: states are added and subtracted by the space's ⊞ and ⊟ (Hertzberg et al., 2013), which
+for (attitude, rate) is E. Kraft, "A quaternion-based unscented Kalman filter for orientation tracking" (2003).
+All functions take leading batch axes.
+
+Letters, for d directions of the state and m of the measurement:
+P (*, d, d) covariance, Q process noise, R measurement noise, C (*, d, m) cross-covariance, S (*, m, m) innovation
+covariance, K (*, d, m) gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.quaternions import Array
+from viz_estim.core.run import Tick
+from viz_estim.core.spaces import Euclidean, Product, Space
+from viz_estim.core.stages import Innovation, SigmaPoints, Stage, UnscentedPredict, UnscentedUpdate
+
+
+class Rule(NamedTuple):
+    """Where sigma points lie and what they weigh: points at mean ⊞ chol(P)·unit[i], unit (N, d)."""
+
+    unit: Array
+    mean_weights: Array
+    cov_weights: Array
+
+
+@cache
+def symmetric(d: int) -> Rule:
+    """The 2d points at ±√d·columns, equally weighted, none at the mean (Julier et al. 1995; Kraft 2003, eq. 34)."""
+    unit = np.sqrt(d) * np.concatenate([np.eye(d), -np.eye(d)])
+    weights = np.full(2 * d, 0.5 / d)
+    return Rule(unit, weights, weights)
+
+
+@cache
+def scaled(d: int, alpha: float = 1e-3, beta: float = 2.0, kappa: float = 0.0) -> Rule:
+    """The scaled 2d+1 points (Wan and van der Merwe 2000, eq. 15); the first lies at the mean."""
+    lam = alpha**2 * (d + kappa) - d
+    unit = np.sqrt(d + lam) * np.concatenate([np.zeros((1, d)), np.eye(d), -np.eye(d)])
+    mean_weights = np.full(2 * d + 1, 0.5 / (d + lam))
+    mean_weights[0] = lam / (d + lam)
+    cov_weights = mean_weights.copy()
+    cov_weights[0] += 1 - alpha**2 + beta
+    return Rule(unit, mean_weights, cov_weights)
+
+
+def draw(space: Space, mean: Array, cov: Array, rule: Rule) -> SigmaPoints:
+    """Sigma points of N(mean, cov). LinAlgError where cov is not positive definite: nothing is added to mend it."""
+    offsets = rule.unit @ np.swapaxes(np.linalg.cholesky(cov), -1, -2)
+    return SigmaPoints(space, space.plus(mean[..., None, :], offsets), rule.mean_weights, rule.cov_weights)
+
+
+def moments(sigma: SigmaPoints) -> tuple[Array, Array, Array]:
+    """Mean (*, n), covariance (*, d, d) and the error vectors (*, N, d) of sigma points (Kraft 2003, eqs. 52–55, 64)."""
+    mean = sigma.space.mean(sigma.points, sigma.mean_weights)
+    errors = sigma.space.minus(sigma.points, mean[..., None, :])
+    return mean, _transposed(errors) @ (sigma.cov_weights[:, None] * errors), errors
+
+
+def predict(
+    belief: Gaussian, move: Callable[[Array], Array], noise: Array, rule: Rule, *, name: str = "predict"
+) -> UnscentedPredict:
+    """The belief moved on, process noise Q added before: x' = move(x ⊞ w), w ~ N(0, Q) (Kraft 2003, eqs. 33–40).
+
+    move maps states (*, N, n) to states; noise Q (d, d).
+    """
+    drawn = draw(belief.space, belief.mean, belief.cov + noise, rule)
+    propagated = SigmaPoints(belief.space, move(drawn.points), drawn.mean_weights, drawn.cov_weights)
+    mean, cov, _ = moments(propagated)
+    return UnscentedPredict(name, Gaussian(belief.space, mean, _symmetrised(cov)), drawn, propagated)
+
+
+def predict_augmented(
+    belief: Gaussian, move: Callable[[Array, Array], Array], noise: Array, rule: Rule, *, name: str = "predict"
+) -> UnscentedPredict:
+    """The belief moved on by x' = move(x, w), w ~ N(0, Q), with w among the sigma points (Julier and Uhlmann 2004).
+
+    The rule is for d + q dimensions, noise Q (q, q); move maps states (*, N, n) and noises (*, N, q) to states.
+    """
+    d, q, n = belief.cov.shape[-1], noise.shape[-1], belief.mean.shape[-1]
+    space = Product(state=belief.space, noise=Euclidean([f"w{i}" for i in range(q)]))
+    joint = np.zeros((*belief.cov.shape[:-2], d + q, d + q))
+    joint[..., :d, :d], joint[..., d:, d:] = belief.cov, noise
+    drawn = draw(space, np.concatenate([belief.mean, np.zeros((*belief.mean.shape[:-1], q))], axis=-1), joint, rule)
+    moved = move(drawn.points[..., :n], drawn.points[..., n:])
+    propagated = SigmaPoints(belief.space, moved, drawn.mean_weights, drawn.cov_weights)
+    mean, cov, _ = moments(propagated)
+    return UnscentedPredict(name, Gaussian(belief.space, mean, _symmetrised(cov)), drawn, propagated)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """How a sensor reads a state: its measurement's space, z = measure(x) ⊞ v with v ~ N(0, noise).
+
+    gate: the probability with which a good reading passes (None: all pass). blind(mean): the unit direction (d,) of
+    the state that the sensor cannot see, if there is one.
+    """
+
+    space: Space
+    measure: Callable[[Array], Array]
+    noise: Array
+    gate: float | None = None
+    blind: Callable[[Array], Array] | None = None
+
+
+class Measurement:
+    """Sensors read at one moment and taken in as one vector; each keeps its name, gate and block of S."""
+
+    def __init__(self, sensors: dict[str, Sensor]) -> None:
+        self.sensors = sensors
+        self.space = Product(**{name: sensor.space for name, sensor in sensors.items()})
+        self.noise = np.zeros((len(self.space.axes),) * 2)
+        for name, sensor in sensors.items():
+            self.noise[self.block(name)] = sensor.noise
+        self.part = np.repeat(np.arange(len(sensors)), [len(s.space.axes) for s in sensors.values()])
+        self.gates = {k: chi2.ppf(s.gate, len(s.space.axes)) for k, s in sensors.items() if s.gate is not None}
+
+    def block(self, name: str) -> tuple[slice, slice]:
+        """The sensor's block of a matrix over the measurement's directions."""
+        return self.space.axes_at[name], self.space.axes_at[name]
+
+    def measure(self, x: Array) -> Array:
+        """The expected reading of all sensors, (*, n)."""
+        return np.concatenate([sensor.measure(x) for sensor in self.sensors.values()], axis=-1)
+
+    def passes(self, residual: Array, cov: Array) -> np.ndarray:
+        """Which sensors' residuals pass their gates, (*, s): νᵀS⁻¹ν ≤ χ²(gate), each by its own block of S."""
+        used = np.ones((*residual.shape[:-1], len(self.sensors)), bool)
+        for i, name in enumerate(self.sensors):
+            if name in self.gates:
+                part, (rows, cols) = residual[..., self.space.axes_at[name]], self.block(name)
+                whitened = np.linalg.solve(cov[..., rows, cols], part[..., None])[..., 0]
+                used[..., i] = (part * whitened).sum(-1) <= self.gates[name]
+        return used
+
+    def blind(self, mean: Array, d: int) -> Array:
+        """Each sensor's blind direction (*, d, s), zero where it has none."""
+        directions = np.zeros((*mean.shape[:-1], d, len(self.sensors)))
+        for i, sensor in enumerate(self.sensors.values()):
+            if sensor.blind is not None:
+                directions[..., i] = sensor.blind(mean)
+        return directions
+
+
+def update(
+    belief: Gaussian,
+    z: Array,
+    measurement: Measurement,
+    rule: Rule,
+    *,
+    sigma: SigmaPoints | None = None,
+    noise: Array | None = None,
+    offered: np.ndarray | None = None,
+    name: str = "update",
+) -> UnscentedUpdate:
+    """The belief after a reading z (*, n): K = C·S⁻¹, mean ⊞ K·ν, P − K·S·Kᵀ (Kraft 2003, eqs. 67–75).
+
+    The covariance is then carried to the tangent space at the new mean, fixed in the world's frame: Kraft's error
+    vectors q_i·q̄⁻¹ are in that frame, ours in the body's, and the transport makes both the same filter.
+
+    sigma: the prediction's own propagated points, which Kraft's filter maps into the measurement; without them, points
+    are drawn from the belief. noise: R in place of the measurement's own. A gated sensor moves nothing: its columns of
+    K are zero.
+    """
+    if sigma is None:
+        sigma = draw(belief.space, belief.mean, belief.cov, rule)
+    mapped = SigmaPoints(measurement.space, measurement.measure(sigma.points), sigma.mean_weights, sigma.cov_weights)
+    R = measurement.noise if noise is None else noise
+    predicted, spread, errors = moments(mapped)
+    S = _symmetrised(spread + R)
+    state_errors = belief.space.minus(sigma.points, belief.mean[..., None, :])
+    C = _transposed(state_errors) @ (sigma.cov_weights[:, None] * errors)
+    residual = measurement.space.minus(z, predicted)
+    used = measurement.passes(residual, S)
+    K = _gain(C, S, used[..., measurement.part])
+    delta = (K @ residual[..., None])[..., 0]
+    mean = belief.space.plus(belief.mean, delta)
+    A = belief.space.transport(belief.mean, delta)
+    cov = _symmetrised(A @ (belief.cov - K @ S @ _transposed(K)) @ _transposed(A))
+    blind = measurement.blind(belief.mean, cov.shape[-1])
+    if offered is None:
+        offered = np.ones_like(used)
+    innovation = Innovation(measurement.space, z, predicted, residual, S, R, C, used, offered, blind)
+    return UnscentedUpdate(name, Gaussian(belief.space, mean, cov), innovation, K, sigma, mapped)
+
+
+def _gain(C: Array, S: Array, used: np.ndarray) -> Array:
+    """C·S⁻¹ over the directions in use (*, m); zero columns for the others."""
+    if not used.all():
+        C = C * used[..., None, :]
+        S = np.where(used[..., None, :] & used[..., :, None], S, np.eye(S.shape[-1]))
+    return _transposed(np.linalg.solve(S, _transposed(C)))
+
+
+@dataclass(frozen=True)
+class UnscentedFilter:
+    """An estimator: one prediction and one joint update a step, Kraft's sigma points carried from one to the other.
+
+    process(points, tick) moves states; process_noise(tick) is Q (d, d) over tick.dt. A sensor with a stand-in on the
+    tick is read as that (z, R), and its part counts as not offered.
+    """
+
+    process: Callable[[Array, Tick], Array]
+    process_noise: Callable[[Tick], Array]
+    measurement: Measurement
+    rule: Rule
+
+    def step(self, belief: Gaussian, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
+        sigma = None
+        if tick.dt > 0:
+            predicted = predict(belief, lambda x: self.process(x, tick), self.process_noise(tick), self.rule)
+            yield predicted
+            belief, sigma = predicted.belief, predicted.propagated
+        names = self.measurement.sensors
+        readings = [tick.stand_ins[s].z if s in tick.stand_ins else tick.measurements[s] for s in names]
+        noise, offered = self.measurement.noise, None
+        if tick.stand_ins:
+            noise, offered = noise.copy(), np.array([s not in tick.stand_ins for s in names])
+            for name in names & tick.stand_ins.keys():
+                noise[self.measurement.block(name)] = tick.stand_ins[name].noise
+        z = np.concatenate(readings, axis=-1)
+        yield update(belief, z, self.measurement, self.rule, sigma=sigma, noise=noise, offered=offered)
+
+    def draw_state(self, space: Space, x: Array, tick: Tick, rng: np.random.Generator) -> Array:
+        """A true next state (*, n) from the filter's own process model: what its consistency is tested on."""
+        return x if tick.dt == 0 else self.process(normal(space, x, self.process_noise(tick), rng), tick)
+
+    def draw_readings(self, x: Array, rng: np.random.Generator) -> dict[str, Array]:
+        """Readings of a true state x (*, n) from the filter's own sensors."""
+        return {k: normal(s.space, s.measure(x), s.noise, rng) for k, s in self.measurement.sensors.items()}
+
+
+def normal(space: Space, mean: Array, cov: Array, rng: np.random.Generator) -> Array:
+    """A draw (*, n) from N(mean, cov) on the space."""
+    white = rng.standard_normal((*mean.shape[:-1], cov.shape[-1], 1))
+    return space.plus(mean, (np.linalg.cholesky(cov) @ white)[..., 0])
+
+
+def _transposed(a: Array) -> Array:
+    return np.swapaxes(a, -1, -2)
+
+
+def _symmetrised(a: Array) -> Array:
+    return 0.5 * (a + _transposed(a))
