@@ -1,0 +1,78 @@
+"""Sensor constants of the IMU: value = sign·(raw − bias)·3300/1023/sensitivity, and their fit to motion capture."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from viz_estim.core.quaternions import Array
+from viz_estim.errors import BadInput
+
+MV_PER_COUNT = 3300.0 / 1023.0  # a 10-bit converter at 3.3 V
+ACCEL_SIGNS = np.array([-1.0, -1.0, 1.0])  # the chip's x and y are mounted against the body's
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Constants (3,) in body order x, y, z: biases in counts, sensitivities in mV/(m/s²) and mV/(rad/s).
+
+    gyro_bias None: to be taken from the data's own still prefix.
+    """
+
+    accel_bias: Array
+    accel_sensitivity: Array
+    gyro_sensitivity: Array
+    gyro_bias: Array | None
+
+    def accel(self, counts: Array) -> Array:
+        """Specific force (*, 3) in m/s² of counts (*, 3)."""
+        return ACCEL_SIGNS * (counts - self.accel_bias) * (MV_PER_COUNT / self.accel_sensitivity)
+
+    def gyro(self, counts: Array) -> Array:
+        """Angular rate (*, 3) in rad/s of counts (*, 3)."""
+        assert self.gyro_bias is not None
+        return (counts - self.gyro_bias) * (MV_PER_COUNT / self.gyro_sensitivity)
+
+    def with_gyro_bias(self, bias: Array) -> Calibration:
+        return replace(self, gyro_bias=bias)
+
+
+TYPICAL_GYRO_BIAS = np.array([373.5, 375.4, 369.6])
+DOCUMENTED = Calibration(
+    accel_bias=np.array([511.5, 500.5, 502.5]),
+    accel_sensitivity=np.array([34.3, 34.2, 33.8]),
+    gyro_sensitivity=np.array([208.0, 201.0, 184.0]),
+    gyro_bias=None,
+)
+
+
+def load(path: Path) -> Calibration:
+    """The constants that `calibrate imu` wrote."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise BadInput(f"{path}: not a JSON file that `calibrate imu` wrote ({error})") from error
+    if not isinstance(values, dict) or values.get("system") != "imu":
+        raise BadInput(
+            f"{path}: not a calibration of the system imu; make one with `calibrate imu --data … --out FILE`"
+        )
+    return Calibration(
+        accel_bias=_numbers(values, "accel", "bias_counts", path),
+        accel_sensitivity=_numbers(values, "accel", "sensitivity_mv_per_mps2", path, positive=True),
+        gyro_bias=_numbers(values, "gyro", "bias_counts", path),
+        gyro_sensitivity=_numbers(values, "gyro", "sensitivity_mv_per_radps", path, positive=True),
+    )
+
+
+def _numbers(values: dict[str, Any], sensor: str, key: str, path: Path, *, positive: bool = False) -> Array:
+    try:
+        numbers = np.array(values[sensor][key], float)
+    except (KeyError, TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all() or (positive and (numbers <= 0).any()):
+        raise BadInput(f"{path}: {sensor}.{key} must be three {'positive ' if positive else ''}numbers (x, y, z)")
+    return numbers

@@ -1,0 +1,246 @@
+"""Files of an IMU with motion capture: which file is what, reading, writing.
+
+The ESE 650 course's format: `imuRaw*.mat` (`vals` 6×T 10-bit counts in the order ax, ay, az, wz, wx, wy; `ts` 1×T,
+Unix s) and `viconRot*.mat` (`rots` 3×3×N body → world; `ts` 1×N). Any other log: CSV or NPZ with `time` [s],
+`gyro_x…z` [rad/s], `accel_x…z` [m/s²] and optionally `qw, qx, qy, qz` (body → world; NaN where there is no truth).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+
+from viz_estim.core import quaternions
+from viz_estim.core.quaternions import Array
+from viz_estim.errors import BadInput
+
+_CHANNELS = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_GYRO_ROWS = [4, 5, 3]  # of `vals`: x, y, z
+_SUFFIXES = (".mat", ".csv", ".npz")
+
+
+@dataclass(frozen=True)
+class ImuLog:
+    """One IMU file: stamps (T,) s; accel, gyro (T, 3), body x, y, z, in 10-bit counts or in m/s² and rad/s.
+
+    truth_stamps (N,) s and truth (N, 4), quaternions body → world, are the reference's own samples, bad ones left out;
+    files are those it was read from.
+    """
+
+    stamps: Array
+    accel: Array
+    gyro: Array
+    in_counts: bool
+    truth_stamps: Array
+    truth: Array
+    files: tuple[Path, ...] = ()
+
+
+def find_sets(paths: list[Path]) -> list[tuple[Path, Path | None]]:
+    """The IMU files among files and folders, each with its motion capture: given, or found beside it by its number."""
+    files = [file for path in paths for file in _expand(path)]
+    roles = {file: _role(file, strict=file in paths) for file in dict.fromkeys(files)}
+    imus = [file for file, role in roles.items() if role == "imu"]
+    truths = [file for file, role in roles.items() if role == "truth"]
+    where = ", ".join(map(str, paths))
+    if not imus:
+        raise BadInput(f"{where}: no IMU file there (a .mat with `vals` and `ts`, or a .csv/.npz log with `time`)")
+    if len(imus) == 1 and len(truths) == 1:
+        return [(imus[0], truths[0])]
+    return [(imu, _truth_of(imu, truths)) for imu in imus]
+
+
+def load(imu: Path, truth: Path | None) -> ImuLog:
+    """The IMU file read and checked, with its reference."""
+    if imu.suffix.lower() == ".mat":
+        return _load_course(imu, truth)
+    columns = _read_columns(imu)
+    missing = [c for c in ("time", *_CHANNELS) if c not in columns]
+    if missing:
+        raise BadInput(f"{imu}: missing {', '.join(missing)} (columns: {', '.join(columns)})")
+    stamps = _stamps(columns["time"], imu, "time")
+    values = {c: _finite(columns[c], imu, c) for c in _CHANNELS}
+    gyro, accel = (np.stack([values[f"{kind}_{axis}"] for axis in "xyz"], axis=1) for kind in ("gyro", "accel"))
+    files, reference = (imu,), (np.empty(0), np.empty((0, 4)))
+    if truth is not None:
+        files, reference = (imu, truth), _load_truth(truth)
+    elif any(c in columns for c in _QUATERNION):
+        missing = [c for c in _QUATERNION if c not in columns]
+        if missing:
+            raise BadInput(f"{imu}: the truth lacks {', '.join(missing)}; give all of {', '.join(_QUATERNION)} or none")
+        reference = _good_truth(stamps, np.stack([columns[c] for c in _QUATERNION], axis=1), imu)
+    return ImuLog(stamps, accel, gyro, False, *reference, files)
+
+
+def save_course(folder: Path, number: int, log: ImuLog) -> list[Path]:
+    """Writes the log as `imuRaw<number>.mat` and `viconRot<number>.mat`, in the course's format and axis order."""
+    vals = np.concatenate([log.accel, log.gyro[:, [2, 0, 1]]], axis=1).T.astype(np.uint16)
+    imu, truth = folder / f"imuRaw{number}.mat", folder / f"viconRot{number}.mat"
+    for path in (imu, truth):
+        if path.exists():
+            raise BadInput(f"{path}: is there already, and may be real data; choose another folder or remove it")
+    scipy.io.savemat(imu, {"vals": vals, "ts": log.stamps[None]}, do_compression=True)
+    # Seven digits are a tenth of a microradian, far below what motion capture resolves, and pack to half the size.
+    rots = np.moveaxis(quaternions.to_matrix(log.truth), 0, -1).round(7)
+    scipy.io.savemat(truth, {"rots": rots, "ts": log.truth_stamps[None]}, do_compression=True)
+    return [imu, truth]
+
+
+def _expand(path: Path) -> list[Path]:
+    if path.is_dir():
+        return [file for file in sorted(path.iterdir()) if file.suffix.lower() in _SUFFIXES]
+    if not path.exists():
+        raise BadInput(f"{path}: no such file or folder")
+    return [path]
+
+
+def _role(path: Path, *, strict: bool) -> str | None:
+    """imu, truth, camera or None by the file's fields; None is an error for a file that was named itself."""
+    try:
+        if path.suffix.lower() == ".mat":
+            fields = {name for name, *_ in scipy.io.whosmat(path)}
+            role = "truth" if "rots" in fields else "imu" if "vals" in fields else "camera" if "cam" in fields else None
+        else:
+            role = "imu" if "time" in _read_columns(path) else None
+    except (BadInput, OSError):
+        if strict:
+            raise
+        return None
+    except Exception as error:  # scipy raises whatever a damaged file makes it trip over
+        if strict:
+            raise _unreadable(path, error) from error
+        return None
+    if role is None and strict:
+        raise BadInput(
+            f"{path}: neither an IMU file (`vals`, `ts`, or columns time, {', '.join(_CHANNELS)}) nor motion capture "
+            "(`rots`, `ts`)"
+        )
+    return role
+
+
+def _truth_of(imu: Path, truths: list[Path]) -> Path | None:
+    number = _number(imu)
+    if number is None:
+        return None
+    beside = [imu.parent / f"viconRot{number}.mat", imu.parent.parent / "vicon" / f"viconRot{number}.mat"]
+    return next((t for t in truths if _number(t) == number), next((t for t in beside if t.exists()), None))
+
+
+def _number(path: Path) -> str | None:
+    match = re.search(r"(\d+)$", path.stem)
+    return match.group(1) if match else None
+
+
+def _load_course(imu: Path, truth: Path | None) -> ImuLog:
+    fields = _read_mat(imu)
+    vals = _field(fields, "vals", imu)
+    if vals.ndim != 2 or vals.shape[0] != 6:
+        raise BadInput(f"{imu}: expected `vals` of shape 6×T (ax, ay, az, wz, wx, wy), got {_shape(vals)}")
+    # Unsigned counts wrap around when a bias is subtracted: floats from here on.
+    vals = _finite(vals.astype(float), imu, "vals")
+    stamps = _stamps(_field(fields, "ts", imu).astype(float).ravel(), imu, "ts")
+    if len(stamps) != vals.shape[1]:
+        raise BadInput(f"{imu}: `ts` has {len(stamps)} stamps and `vals` {vals.shape[1]} columns; they must agree")
+    reference = (np.empty(0), np.empty((0, 4))) if truth is None else _load_truth(truth)
+    files = (imu,) if truth is None else (imu, truth)
+    return ImuLog(stamps, vals[:3].T.copy(), vals[_GYRO_ROWS].T.copy(), True, *reference, files)
+
+
+def _load_truth(path: Path) -> tuple[Array, Array]:
+    fields = _read_mat(path)
+    rots = _field(fields, "rots", path).astype(float)
+    if rots.ndim != 3 or rots.shape[:2] != (3, 3):
+        raise BadInput(f"{path}: expected `rots` of shape 3×3×N, got {_shape(rots)}")
+    stamps = _field(fields, "ts", path).astype(float).ravel()
+    if len(stamps) != rots.shape[2]:
+        raise BadInput(f"{path}: `ts` has {len(stamps)} stamps and `rots` {rots.shape[2]} frames; they must agree")
+    matrices = np.moveaxis(rots, -1, 0)
+    # Lost frames come as NaN or as anything that is no rotation.
+    good = np.isfinite(matrices).all((1, 2))
+    good[good] = np.abs(matrices[good] @ np.swapaxes(matrices[good], 1, 2) - np.eye(3)).max((1, 2)) < 0.05
+    good[good] = np.linalg.det(matrices[good]) > 0
+    q = np.full((len(stamps), 4), np.nan)
+    q[good] = quaternions.from_matrix(matrices[good])
+    return _good_truth(_stamps(stamps, path, "ts"), q, path)
+
+
+def _good_truth(stamps: Array, q: Array, path: Path) -> tuple[Array, Array]:
+    good = np.isfinite(q).all(1)
+    if np.any(np.abs(np.linalg.norm(q[good], axis=1) - 1) > 0.01):
+        raise BadInput(f"{path}: qw, qx, qy, qz are not unit quaternions (NaN marks a missing truth)")
+    return stamps[good], quaternions.continuous(quaternions.normalise(q[good]))
+
+
+def _read_mat(path: Path) -> dict[str, Any]:
+    try:
+        fields: dict[str, Any] = scipy.io.loadmat(path)
+    except OSError:
+        raise
+    except Exception as error:  # scipy raises whatever a damaged file makes it trip over
+        raise _unreadable(path, error) from error
+    return fields
+
+
+def _read_columns(path: Path) -> dict[str, Array]:
+    try:
+        if path.suffix.lower() == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                columns = {name: np.asarray(file[name], float) for name in file.files}
+        else:
+            with path.open(encoding="utf-8-sig") as text:
+                names = [name.strip() for name in text.readline().split(",")]
+                table = np.genfromtxt(text, delimiter=",", ndmin=2)
+            if table.shape[1] != len(names):
+                raise BadInput(f"{path}: {len(names)} column names and {table.shape[1]} columns")
+            columns = dict(zip(names, table.T, strict=True))
+    except (BadInput, OSError):
+        raise
+    except Exception as error:
+        raise _unreadable(path, error) from error
+    if any(column.ndim != 1 or len(column) != len(columns["time"]) for column in columns.values() if "time" in columns):
+        raise BadInput(f"{path}: all columns must be one-dimensional and as long as `time`")
+    return columns
+
+
+def _unreadable(path: Path, error: Exception) -> BadInput:
+    text = " ".join(str(error).split()) or type(error).__name__
+    return BadInput(f"{path}: cannot be read, it may be truncated or of another format ({text[:120]})")
+
+
+def _field(fields: dict[str, Any], name: str, path: Path) -> np.ndarray:
+    if name not in fields:
+        held = ", ".join(k for k in fields if not k.startswith("__")) or "nothing"
+        raise BadInput(f"{path}: no field `{name}` (it holds {held})")
+    value = np.asarray(fields[name])
+    if value.dtype.kind not in "uifb":
+        raise BadInput(f"{path}: `{name}` must hold numbers")
+    return value
+
+
+def _finite(values: Array, path: Path, name: str) -> Array:
+    bad = ~np.isfinite(values)
+    if bad.any():
+        raise BadInput(
+            f"{path}: {name} is not a number at sample {np.argwhere(bad)[0][-1]}; measurements must be finite"
+        )
+    return values
+
+
+def _stamps(stamps: Array, path: Path, name: str) -> Array:
+    if len(stamps) < 2:
+        raise BadInput(f"{path}: {name} has {len(stamps)} samples; at least 2 are needed")
+    _finite(stamps, path, name)
+    back = np.flatnonzero(np.diff(stamps) < 0)
+    if len(back):
+        raise BadInput(f"{path}: {name} goes back at sample {back[0] + 1}; sort the samples by time")
+    return stamps
+
+
+def _shape(array: np.ndarray) -> str:
+    return "×".join(map(str, array.shape)) or "a single number"

@@ -1,0 +1,84 @@
+"""What an IMU's own readings tell before any filter runs: how long it lies still, and where its gyro is frozen."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
+
+from viz_estim.core import quaternions
+from viz_estim.core.quaternions import Array
+
+_BASELINE = 0.5  # s: the shortest prefix that counts as lying still
+_SMOOTHING = 0.1  # s
+_STILL = (0.02, 0.15)  # rad/s, m/s²: a change of the smoothed reading that is motion
+_STEADY = (0.1, 0.5)  # rad/s, m/s²: more scatter than this within the baseline is motion, whatever the sensor
+_LEVEL = (0.25, 1.0)  # rad/s, m/s²: how far from 0 and from gravity a still sensor may read; beyond, it turns steadily
+_SHORTEST_FREEZE = 0.3  # s
+_UNEXPLAINED = (0.1, 0.5)  # rad: gravity's turn that the gyro must have missed; off its rest level, and on it
+
+GRAVITY = 9.81  # m/s²
+
+
+def still_prefix(stamps: Array, gyro: Array, accel: Array) -> int:
+    """The number of samples from the first on in which the sensor lies still; 0 where it moves from the start.
+
+    gyro (T, 3) rad/s and accel (T, 3) m/s². The first half second is the baseline; motion begins where the mean over
+    0.1 s leaves it by more than noise can, and is dated back by half that window.
+    """
+    n = int(np.searchsorted(stamps, stamps[0] + _BASELINE))
+    if n < 5 or n >= len(stamps):
+        return 0
+    width = max(3, round(n * _SMOOTHING / _BASELINE))
+    end = len(stamps)
+    for values, floor, steady, level in zip((gyro, accel), _STILL, _STEADY, _LEVEL, strict=True):
+        base, scatter = values[:n].mean(0), values[:n].std(0)
+        at_rest = GRAVITY if values is accel else 0.0
+        if scatter.max() > steady or abs(float(np.linalg.norm(base)) - at_rest) > level:
+            return 0
+        bound = np.maximum(floor, 6.0 * scatter / np.sqrt(width))
+        moved = (np.abs(uniform_filter1d(values, width, axis=0, mode="nearest") - base) > bound).any(1)
+        if moved.any():
+            end = min(end, int(np.argmax(moved)) - width // 2)
+    return end if end >= n else 0
+
+
+def frozen_gyro(stamps: Array, gyro: Array, accel: Array, bias: Array) -> np.ndarray:
+    """Which samples (T,) were taken while the gyro was stuck: flat in all channels while gravity turns.
+
+    gyro (T, 3) rad/s as read and bias (3,) its reading at rest; accel (T, 3) m/s². A stuck gyro still flickers by one
+    quantum, and so does one that rests; what tells them apart is the accelerometer: gravity's direction turns by more
+    than the stuck rates account for.
+    """
+    frozen = np.zeros(len(stamps), bool)
+    width = round(_SHORTEST_FREEZE / max(float(np.median(np.diff(stamps))), 1e-6)) | 1  # odd: the windows are centred
+    if width < 3 or width >= len(stamps):
+        return frozen
+    quantum = np.array([_quantum(channel) for channel in gyro.T])
+    span = maximum_filter1d(gyro, width, axis=0) - minimum_filter1d(gyro, width, axis=0)
+    centres = (span <= 2.01 * quantum).all(1)
+    # The windows at the two ends would lean on samples mirrored in; the flat runs are the union of the flat windows.
+    centres[: width // 2] = centres[-(width // 2) :] = False
+    flat = maximum_filter1d(centres, width)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]])))
+    for first, end in edges.reshape(-1, 2):
+        rate = gyro[first:end].mean(0) - bias
+        off_rest = bool((np.abs(rate) > 3 * quantum).any())
+        if _missed_turn(stamps[first:end], rate, accel[first:end]) > _UNEXPLAINED[0 if off_rest else 1]:
+            frozen[first:end] = True
+    return frozen
+
+
+def _quantum(channel: Array) -> float:
+    """The smallest step between a channel's readings: one count, or next to nothing for a fine log."""
+    steps = np.diff(np.unique(channel))
+    steps = steps[steps > 1e-6 * max(np.ptp(channel), 1e-12)]
+    return float(steps.min()) if len(steps) else 0.0
+
+
+def _missed_turn(stamps: Array, rate: Array, accel: Array) -> float:
+    """The largest angle (rad) between gravity as the accelerometer saw it and as a constant rate would carry it."""
+    width = max(3, len(stamps) // 10)
+    seen = uniform_filter1d(accel, width, axis=0, mode="nearest")
+    seen = seen / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-9)
+    carried = quaternions.rotate(quaternions.exp(-(stamps - stamps[0])[:, None] * rate), seen[:1])
+    return float(np.arccos(np.clip((seen * carried).sum(1), -1, 1)).max())
