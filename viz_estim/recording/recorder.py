@@ -1,0 +1,217 @@
+"""Steps into a recording file: buffered, sent as columns, safe against a kill, complete to the last bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import threading
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from viz_estim.core.run import Scenario, Step
+from viz_estim.core.spaces import describe
+from viz_estim.core.stages import Innovation, SigmaPoints, Stage
+from viz_estim.recording import blueprints, schema
+from viz_estim.recording.columns import Times, numbers
+from viz_estim.recording.drawing import Drawing
+from viz_estim.recording.layout import Layout
+
+_ROWS = 1000
+_BYTES = 8 << 20
+_SECONDS = 0.3
+_SECONDS_WATCHED = 0.05  # while a viewer watches
+
+Sink = rr.FileSink | rr.GrpcSink
+
+
+class Recorder:
+    """Writes a run's steps to `path`, as `NAME.partial.rrd` until it is closed well, and to a live viewer beside it.
+
+    properties: JSON-ready facts of the run, kept with the recording. every: geometry (sigma points) is drawn and kept
+    at every N-th step only. live: the gRPC address of a viewer. Use it as a context manager: leaving it by an
+    exception keeps the partial file.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        scenario: Scenario,
+        properties: dict[str, Any],
+        *,
+        every: int = 1,
+        live: str | None = None,
+    ) -> None:
+        self.path, self.partial = path, partial_of(path)
+        self._every = every
+        self._layout = Layout(scenario.space)
+        self._rows: list[Step] = []
+        self._limit = 1  # the first step goes out alone: it tells the size of the others, and the view
+        self._stages = 0
+        self._lock = threading.Lock()
+        self._failed: Exception | None = None
+        self._closed = threading.Event()
+        name = str(properties.get("scenario", path.stem))
+        # A view belongs to an application id: runs of one scenario share what a person arranges in the viewer.
+        self._stream = rr.RecordingStream(f"viz_estim {name}", send_properties=False)
+        sinks: list[Sink] = [rr.FileSink(self.partial)]
+        self._stream.set_sinks(*sinks, *([rr.GrpcSink(live)] if live else []))
+        self._stream.send_recording_name(path.stem)
+        self._drawing = Drawing(self._stream, self._layout, scenario)
+        self._properties = dict(properties) | {"space": describe(scenario.space)}
+        self._send_properties()
+        notes = f"{scenario.notes}\n\n{schema.LEGEND}".strip()
+        self._stream.log(schema.NOTES, rr.TextDocument(notes, media_type="text/markdown"), static=True)
+        seconds = _SECONDS_WATCHED if live else _SECONDS
+        self._timer = threading.Thread(target=self._tick, args=(seconds,), daemon=True)
+        self._timer.start()
+
+    def add(self, step: Step) -> None:
+        """Takes in one step; it reaches the file within a second."""
+        if self._failed:
+            raise self._failed
+        with self._lock:
+            self._rows.append(step)
+            if len(self._rows) >= self._limit:
+                self._flush()
+
+    def close(self, result: dict[str, Any] | None = None) -> None:
+        """Ends the recording well: the result is kept with it, and the file takes its own name."""
+        self._stop()
+        if self._failed:
+            raise self._failed
+        self._properties["result"] = result
+        self._send_properties()
+        self._stream.send_blueprint(blueprints.build(self._layout))
+        self._disconnect()
+        os.replace(self.partial, self.path)
+
+    def abort(self) -> None:
+        """Ends the recording where it is; the partial file stays."""
+        self._stop()
+        self._disconnect()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        if not self._closed.is_set():
+            self.abort() if kind else self.close()
+
+    def _stop(self) -> None:
+        self._closed.set()
+        self._timer.join()
+        with self._lock:
+            self._flush()
+
+    def _disconnect(self) -> None:
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _tick(self, seconds: float) -> None:
+        while not self._closed.wait(seconds):
+            with self._lock:
+                try:
+                    self._flush()
+                except Exception as error:  # told at the next step, in the thread that can act on it
+                    self._failed = error
+                    return
+
+    def _send_properties(self) -> None:
+        texts = {name: json.dumps(value) for name, value in (self._properties | self._layout.as_json()).items()}
+        self._stream.send_property("viz_estim", rr.AnyValues(drop_untyped_nones=False, **texts))
+
+    def _flush(self) -> None:
+        """Sends what is buffered: the steps, their stages by name, and what is drawn of them."""
+        steps, self._rows = self._rows, []
+        if not steps:
+            return
+        # A step without any stage (it failed at once) still takes a place on the stage timeline.
+        counts = np.array([max(1, len(step.stages)) for step in steps])
+        first = self._stages + np.concatenate([[0], np.cumsum(counts[:-1])])
+        self._stages += int(counts.sum())
+        times = Times(np.array([step.index for step in steps]), np.array([step.tick.time for step in steps]), first)
+        new = self._layout.learn(steps)
+        self._send_steps(steps, times)
+        kept = [(row, place, stage) for row, step in enumerate(steps) for place, stage in enumerate(step.stages)]
+        by_name: dict[str, list[tuple[int, int, Stage]]] = {}
+        for entry in kept:
+            by_name.setdefault(entry[2].name, []).append(entry)
+        for name, entries in by_name.items():
+            rows = np.array([row for row, _, _ in entries])
+            places = np.array([place for _, place, _ in entries])
+            at = Times(times.step[rows], times.time[rows], first[rows] + places)
+            self._send_stage(name, [stage for _, _, stage in entries], at)
+        self._drawing.add(steps, times, counts, self._every)
+        if new:
+            self._send_properties()
+            self._stream.send_blueprint(blueprints.build(self._layout))
+        for step in steps:
+            if step.error:
+                text = f"step {step.index}, stage {step.error.stage}: {step.error.message}"
+                row = Times(*(np.array([v]) for v in (step.index, step.tick.time, self._stages - 1)))
+                self._send(schema.EVENTS, row, rr.TextLog.columns(text=[text], level=["ERROR"]))
+        self._stream.flush()
+        if self._limit == 1:
+            self._limit = max(1, min(_ROWS, _BYTES // max(1, _size(steps[0]))))
+
+    def _send(self, path: str, at: Times, columns: Iterable[rr.ComponentColumn]) -> None:
+        rr.send_columns(path, at.columns(), columns, recording=self._stream, strict=True)
+
+    def _send_steps(self, steps: list[Step], at: Times) -> None:
+        columns = [numbers("viz_estim.Step", "dt", [np.array(step.tick.dt) for step in steps])]
+        optional = {"truth": [s.truth for s in steps], "control": [s.tick.control for s in steps]}
+        for sensor in self._layout.inputs:
+            optional[f"z.{sensor}"] = [s.tick.measurements.get(sensor) for s in steps]
+            optional[f"raw.{sensor}"] = [s.tick.raw.get(sensor) for s in steps]
+        columns += [
+            numbers("viz_estim.Step", name, rows)
+            for name, rows in optional.items()
+            if any(row is not None for row in rows)
+        ]
+        self._send(schema.STEPS, at, columns)
+
+    def _send_stage(self, name: str, stages: list[Stage], at: Times) -> None:
+        kind = "viz_estim.Stage"
+        columns = [
+            numbers(kind, "mean", [s.belief.mean for s in stages]),
+            numbers(kind, "cov", [s.belief.cov for s in stages]),
+        ]
+        drawn = at.step % self._every == 0
+        for field in dataclasses.fields(stages[0])[2:]:
+            values = [getattr(stage, field.name) for stage in stages]
+            if isinstance(values[0], SigmaPoints):
+                rows = [v.points if d else None for v, d in zip(values, drawn, strict=True)]
+                columns.append(numbers(kind, f"{field.name}.points", rows))
+            elif isinstance(values[0], Innovation):
+                columns += [
+                    numbers(kind, f"{field.name}.{part}", [getattr(v, part) for v in values])
+                    for part in Innovation.__slots__
+                    if part != "space"
+                ]
+            elif isinstance(values[0], np.ndarray):
+                columns.append(numbers(kind, field.name, values))
+        self._send(schema.stage(name), at, columns)
+
+
+def partial_of(path: Path) -> Path:
+    """Where a recording lies while its run goes on."""
+    return path.with_name(f"{path.stem}.partial.rrd")
+
+
+def _size(step: Step) -> int:
+    """About the bytes of a step: what its arrays hold."""
+    total = 0
+    for stage in step.stages:
+        pending: list[Any] = [getattr(stage, field.name) for field in dataclasses.fields(stage)]
+        while pending:
+            value = pending.pop()
+            if isinstance(value, np.ndarray):
+                total += value.nbytes
+            elif dataclasses.is_dataclass(value):
+                pending += [getattr(value, field.name) for field in dataclasses.fields(value)]
+    return total

@@ -1,0 +1,44 @@
+"""A recording that was cut off inside a message, as a kill leaves it: everything before that message is sound."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import struct
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+# An .rrd stream is a header of 12 bytes and messages of two little-endian uint64, kind and length, and a payload.
+_MAGIC, _HEADER, _MESSAGE = b"RRF2", 12, struct.Struct("<QQ")
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """The recording itself, or for the time of the context a copy of it up to its last whole message."""
+    end = _sound_end(path)
+    if end == path.stat().st_size:
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="viz_estim_") as folder:
+        copy = Path(folder) / path.name
+        shutil.copyfile(path, copy)
+        with copy.open("r+b") as file:
+            file.truncate(end)
+        yield copy
+
+
+def _sound_end(path: Path) -> int:
+    """Where the last whole message ends; the file's size where it is no stream that we know (others judge it)."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if size < _HEADER or file.read(len(_MAGIC)) != _MAGIC:
+            return size
+        end = _HEADER
+        while end + _MESSAGE.size <= size:
+            file.seek(end)
+            _, length = _MESSAGE.unpack(file.read(_MESSAGE.size))
+            if end + _MESSAGE.size + length > size:
+                break
+            end += _MESSAGE.size + length
+    return end

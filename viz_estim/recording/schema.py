@@ -1,0 +1,101 @@
+"""The contract of a recording: every entity path, what it holds, in which unit and frame; and the colours' meanings.
+
+Three timelines are on every row: `step` (sequence), `time` (duration, s from the first stamp), `stage` (sequence over
+all stages of the run). A row that only clears what a past stage drew carries `stage` alone.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+Colour = tuple[int, int, int]
+
+# One meaning a colour, in every view.
+ESTIMATE: Colour = (255, 176, 0)
+TRUTH: Colour = (235, 235, 235)
+SENSORS: dict[str, Colour] = {
+    "cyan": (0, 190, 200),
+    "violet": (190, 120, 255),
+    "pink": (255, 120, 170),
+    "olive": (150, 190, 90),
+}
+BAND: Colour = (120, 120, 130)
+AXES: tuple[Colour, ...] = ((235, 70, 70), (80, 200, 90), (80, 130, 255))  # x, y, z
+HEALTH: dict[str, Colour] = {
+    "used": (60, 120, 75),
+    "gated": (200, 150, 60),
+    "frozen, used": (220, 50, 50),
+    "frozen, rejected": (150, 70, 70),
+    "absent": (70, 70, 70),
+}
+
+LEGEND = (
+    "**Colours:** amber is the estimate, white the truth, grey lines its bounds, each sensor has its own; red, green "
+    "and blue are the x, y and z axes. On the `stage` timeline each stage shows what it alone drew."
+)
+
+STEPS = "/steps"
+NOTES = "/notes"
+EVENTS = "/events"
+LANES = "/lanes"
+WORLD = "/world"
+PLOTS = "/plots"
+
+
+def sensor_colour(place: int) -> tuple[str, Colour]:
+    """The colour's name and value for the sensor that came at that place."""
+    return list(SENSORS.items())[place % len(SENSORS)]
+
+
+def stage(name: str) -> str:
+    return f"/stages/{name}"
+
+
+def drawn(name: str, field: str) -> str:
+    return f"{WORLD}/{name}/{field}"
+
+
+def sensor(name: str) -> str:
+    return f"/sensors/{name}"
+
+
+def plot(group: str, component: str) -> str:
+    return f"{PLOTS}/{group}/{component}"
+
+
+def lane(name: str) -> str:
+    return f"{LANES}/{name}"
+
+
+class Entry(NamedTuple):
+    """One line of the contract."""
+
+    path: str
+    holds: str
+    unit: str
+    frame: str
+
+
+ENTITIES = (
+    Entry(STEPS, "`viz_estim.Step`: dt, truth, control, and of each sensor `z.<sensor>`, `raw.<sensor>`", "as the scenario's spaces say", ""),
+    Entry("/stages/{stage}", "`viz_estim.Stage`: mean, cov, and the stage's own numbers (`gain`, `innovation.residual`, `sigma.points`, …), float64, row-major", "SI, radians", "covariances in the tangent space at the mean (body)"),
+    Entry("/world/estimate, /world/truth", "`Boxes3D`, `Arrows3D`: the body and its axes", "box not to scale", "world, z up"),
+    Entry("/world/{stage}/{points}", "`Points3D`: sigma points of an attitude, as tips of the body's axes (x red, y green, z blue)", "unit sphere", "world"),
+    Entry("/sensors/{sensor}/mapped", "`Points3D`: sigma points in the sensor's space", "the sensor's", "body"),
+    Entry("/sensors/{sensor}/measured, …/predicted", "`Arrows3D`: the reading, and the mean of what was expected", "the sensor's", "body"),
+    Entry("/plots/state/{part}.{component}", "`Measurements`: estimate with its ±1σ band, truth, and the sensor that reads it", "the part's", "the part's"),
+    Entry("/plots/error/{part}.{axis}", "`Measurements`: the error within ±3σ of the covariance", "deg or the part's", "body (tangent at the estimate)"),
+    Entry("/plots/sigma/{part}", "`Measurements`: √ of the covariance's diagonal", "deg or the part's", "body (tangent at the estimate)"),
+    Entry("/plots/innovation/{sensor}.{axis}", "`Measurements`: the residual within ±3σ of S", "the sensor's", "body"),
+    Entry("/plots/nis/{sensor}", "`Measurements`: normalised innovation squared, with χ²'s 95 % interval", "1", ""),
+    Entry("/lanes/stage, /lanes/{sensor}", "`StateChange`: the stage; whether a sensor was used, gated, frozen or absent", "", ""),
+    Entry(EVENTS, "`TextLog`: what ended a run", "", ""),
+    Entry(NOTES, "`TextDocument`: what to look at", "", ""),
+    Entry("/__properties/viz_estim", "scenario, parameters, seed, data files with sha256, versions, spaces, the run's result (JSON texts)", "", ""),
+)  # fmt: skip
+
+
+def table() -> str:
+    """The contract as a markdown table, as the README shows it."""
+    rows = [f"| `{e.path}` | {e.holds} | {e.unit} | {e.frame} |" for e in ENTITIES]
+    return "\n".join(["| entity | holds | unit | frame |", "|---|---|---|---|", *rows])

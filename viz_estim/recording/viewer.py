@@ -1,0 +1,245 @@
+"""One Rerun viewer process (POSIX): nothing else knows `rerun.experimental.ViewerClient` and the rerun program."""
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import rerun_cli  # type: ignore[import-untyped]
+from rerun.experimental import ViewerClient, ViewerState
+
+from viz_estim.recording.rescue import whole
+
+START_S, SEEK_S, LOAD_S, LOAD_BYTES_PER_S = 30.0, 2.0, 10.0, 10e6  # the longest waits, for slow machines
+
+# What it logs also pops up in the picture for seconds. Let through are the lines with its address, warnings and errors,
+# but not the warnings at its start, which are about the machine: no graphics card, a container.
+QUIET = "egui_wgpu=error,re_renderer::context=error,re_viewer::native=error"
+LOG = f"warn,re_grpc_server=info,re_sdk::web_viewer=info,{QUIET}"
+Size = tuple[int, int]  # width, height in pixels
+
+
+class ViewerError(RuntimeError):
+    """The viewer could not do what was asked: one line, with the remedy."""
+
+
+class Viewer(contextlib.AbstractContextManager["Viewer"]):
+    """A viewer that lives as long as its context: `with Viewer.start(headless=True) as viewer: viewer.open(path)`."""
+
+    _client: ViewerClient
+
+    def __init__(self, *arguments: str, ready: str) -> None:
+        """Starts rerun and waits until it prints `ready`, a pattern whose group is its address."""
+        # The native program, for `rerun` on the path is a script with a child. Port 0: the system picks a free one.
+        program = next(Path(rerun_cli.__file__).parent.rglob("[Rr]erun"), "rerun")
+        command = [str(program), "--bind", "127.0.0.1", "--port", "0", *arguments]
+        self._closed, self._seen = False, 0  # the last of the viewer's log entries that we don't report
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the viewer
+        streams: dict[str, Any] = {"stdout": self._log, "stderr": self._log, "start_new_session": True}
+        environment = os.environ | {"RUST_LOG": LOG, "NO_COLOR": "1"}
+        self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment, **streams)
+        # Were we killed, nobody would call close: the guard ends the viewer when our end of its pipe goes away.
+        guard = ["/bin/sh", "-c", 'read line || kill -s KILL -- "-$0"', str(self._process.pid)]
+        self._guard = subprocess.Popen(guard, stdin=subprocess.PIPE, **streams)
+        for _ in _polls(START_S):
+            if (found := re.search(ready, self._printed())) or not self.alive:
+                break
+        if not found:
+            problem = self._ended()
+            self.close()
+            raise problem
+        self.url = found[1]  # for a run that goes on: `stream.connect_grpc(viewer.url)`
+
+    @classmethod
+    def start(cls, *, headless: bool, size: Size = (1600, 1000)) -> "Viewer":
+        """Starts a viewer of `size` (width, height) pixels, with no window if `headless`, and waits for its answer."""
+        options = ["--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"] + ["--headless"] * headless
+        with contextlib.ExitStack() as undo:
+            viewer = undo.enter_context(cls(*options, ready=r"Listening for gRPC .*`rerun --connect (\S+)`"))
+            viewer._client = viewer._ask(ViewerClient.connect, viewer.url)
+            viewer._state()  # answered by the window's loop
+            undo.pop_all()
+        return viewer
+
+    @property
+    def alive(self) -> bool:
+        """Whether the viewer's process runs."""
+        return self._process.poll() is None
+
+    def open(self, *paths: str | Path) -> None:
+        """Opens recordings, waits until each has loaded, and stops the cursor, for the viewer plays what it opens."""
+        for path in map(_existing, paths):
+            with whole(path) as sound:  # of a run that was killed, what is sound
+                self._load(sound)
+
+    def _load(self, path: Path) -> None:
+        self._forget()
+        known = {recording.store_id for recording in self._state().recordings}
+        opened = self._ask(self._client.open, str(path)).store_ids
+        for _ in _polls(LOAD_S + path.stat().st_size / LOAD_BYTES_PER_S):
+            state = self._state()
+            new = [r for r in state.recordings if (r.store_id in opened if opened else r.store_id not in known)]
+            # A recording is listed from its first message on, and has timelines only once its data is there.
+            if new and not state.loading and all(recording.timelines for recording in new):
+                break
+            if not new and (errors := self._logged("ERROR")):  # "Failed to … File path: P: CAUSE File path: P"
+                cause = errors[-1].removesuffix(f" File path: {path}").split(f"{path}: ")[-1]
+                raise ViewerError(f"{path}: damaged or not a recording ({cause}); record it again")
+        else:
+            raise ViewerError(f"{path}: has no data on any timeline; is it a recording?")
+        self._ask(self._client.set_time, play_state="paused")
+
+    def seek(self, timeline: str, value: float | None = None) -> None:
+        """Moves the front recording's cursor, and waits until it is there; a moment still on its way is waited for.
+
+        `step` and `stage` are counted from 0, `time` is in seconds; None is the timeline's end.
+        """
+        sent, problem = None, "no recording is open; open one first"
+        for _ in _polls(SEEK_S):
+            state = self._state()
+            for front in [recording for recording in state.recordings if recording.store_id == state.active_recording]:
+                problem = f"no timeline {timeline!r}; choose from: {', '.join(line.name for line in front.timelines)}"
+                for line in [line for line in front.timelines if line.name == timeline]:
+                    scale, slack = (1, 0) if line.time_type == "sequence" else (1e9, 1e6)  # ns; times are typed rounded
+                    first, last = line.start or 0, line.end or 0
+                    target = last if value is None else round(value * scale)
+                    problem = f"{timeline} {value} is not recorded; choose from {first / scale:g} to {last / scale:g}"
+                    if first - slack <= target <= last + slack:
+                        goal = (timeline, min(max(target, first), last))
+                        if sent == goal == (front.current_timeline, front.current_time):
+                            return
+                        # `sequence` passes the integer as it is, on timelines of every kind.
+                        self._ask(self._client.set_time, timeline, sequence=goal[1], play_state="paused")
+                        sent, problem = goal, "the cursor did not stay where it was put; try again"
+        raise ViewerError(problem)
+
+    def problems(self) -> list[str]:
+        """What views could not draw, and what the viewer warned of since the newest `open`: a line each."""
+        reports = [(view.name, report) for view in self._state().views for report in view.reports]
+        lines = [f"{name}: {report.severity}: {report.summary} {report.details or ''}" for name, report in reports]
+        return [" ".join(line.split()) for line in lines] + self._logged("WARN", "ERROR")
+
+    def views(self) -> list[tuple[str, str, bool]]:
+        """Name, class (`3D`, `TimeSeries`, …) and visibility of each view of the blueprint in front."""
+        return [(view.name, view.view_class, view.visible) for view in self._state().views]
+
+    def snapshot(self, path: str | Path, settle: float = 10.0) -> bool:
+        """Writes the whole viewer as a PNG, whole or not at all; False if it still changed after `settle` seconds."""
+        png, path, part = b"", Path(path), Path(f"{path}.{os.getpid()}.part")
+        for _ in _polls(settle):  # chunks load and plots lay out over several frames: two equal ones end it
+            before, png = png, self._ask(self._client.take_screenshot)
+            if still := png == before and not self._state().loading:
+                break
+        try:
+            part.write_bytes(png)
+            part.replace(path)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise ViewerError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+        return still
+
+    def detach(self) -> None:
+        """Leaves the viewer to a person: it outlives us."""
+        self._guard.communicate(b"\n")  # a line, and not the pipe's end: the guard goes without a kill
+        self._closed = True
+        self._log.close()
+
+    def close(self, *exception: object) -> None:
+        """Ends the viewer with all its processes; it may be dead already, or closed."""
+        if not self._closed:
+            self._closed = True
+            self._guard.kill()
+            self._guard.communicate()
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+            self._log.close()
+
+    __exit__ = close
+
+    def _ask(self, method: Callable[..., Any], *arguments: object, **options: object) -> Any:
+        if self._closed:
+            raise ViewerError("the viewer was closed; start another")
+        try:
+            return method(*arguments, **options)
+        except (OSError, RuntimeError, ValueError) as error:
+            with contextlib.suppress(subprocess.TimeoutExpired):  # a connection breaks before its process has ended
+                self._process.wait(1.0)
+            refused = ViewerError(f"the viewer refused ({str(error).splitlines()[0]}); try again")
+            raise (refused if self.alive else self._ended()) from error
+
+    def _state(self) -> ViewerState:
+        return self._ask(self._client.get_state)  # type: ignore[no-any-return]
+
+    def _forget(self) -> None:
+        self._seen = max((entry.sequence for entry in self._ask(self._client.get_logs)), default=0)
+
+    def _logged(self, *levels: str) -> list[str]:
+        entries = [entry for entry in self._ask(self._client.get_logs, self._seen) if entry.level in levels]
+        return [" ".join(f"viewer: {entry.level.lower()}: {entry.message}".split()) for entry in entries]
+
+    def _printed(self) -> str:
+        return os.pread(self._log.fileno(), 1 << 20, 0).decode(errors="replace")  # seek would move the viewer's offset
+
+    def _ended(self) -> ViewerError:
+        log = self._printed()
+        if "No graphics adapter was found" in log or "Failed to get render context" in log:
+            return ViewerError("the viewer found no graphics driver: apt-get install mesa-vulkan-drivers")
+        if "EventLoopError" in log:
+            return ViewerError("the viewer cannot reach the display: use --web, or viz-estim snapshot for a picture")
+        lines = [line for line in log.splitlines() if re.match("Error|.*(panicked| ERROR )", line)]
+        return ViewerError(
+            f"the viewer has ended ({lines[-1] if lines else 'it was killed or closed'}); start it again"
+        )
+
+
+def snapshot(
+    recording: Path, png: Path, *, timeline: str = "step", value: float | None = None, size: Size = (1600, 1000)
+) -> list[str]:
+    """Draws one moment of a recording (`Viewer.seek`) without a display; returns `Viewer.problems`."""
+    with Viewer.start(headless=True, size=size) as viewer:
+        viewer.open(recording)
+        viewer.seek(timeline, value)
+        still = viewer.snapshot(png)
+        return viewer.problems() + ([] if still else ["viewer: warning: the picture had not settled when it was taken"])
+
+
+def open_files(paths: list[Path], *, web: bool = False) -> None:
+    """Opens recordings for a person: in a window that outlives us, or with `web` in a page served until Ctrl-C."""
+    files = [_existing(path) for path in paths]
+    if web:
+        with contextlib.ExitStack() as stack:
+            sound = [str(stack.enter_context(whole(file))) for file in files]
+            options = ["--web-viewer", "--web-viewer-port", "0", *sound]
+            server = stack.enter_context(Viewer(*options, ready=r"Hosting a web-viewer .* connect at (\S+)"))
+            print(f"{server.url}\nCtrl-C ends it", flush=True)
+            with contextlib.suppress(KeyboardInterrupt):
+                server._process.wait()
+                raise server._ended()
+    elif sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError("there is no display: use --web for a browser, or viz-estim snapshot for a picture")
+    else:
+        with Viewer.start(headless=False) as viewer:
+            viewer.open(*files)
+            viewer.detach()
+
+
+def _existing(path: str | Path) -> Path:
+    if not Path(path).is_file():
+        raise ViewerError(f"{path}: no such file; viz-estim run writes recordings")
+    return Path(path).resolve()
+
+
+def _polls(seconds: float) -> Iterator[None]:
+    deadline = time.monotonic() + seconds
+    yield
+    while time.monotonic() < deadline:
+        time.sleep(0.02)
+        yield
