@@ -1,0 +1,278 @@
+"""The command line: what a person types. Each command is a function of its parsed arguments."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn
+
+from viz_estim import printing
+from viz_estim.errors import BadInput
+from viz_estim.parameters import nearest
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one command; returns the exit code: 0 done, 1 the answer is "no", 2 wrong usage or bad input."""
+    try:
+        arguments = _parser().parse_args(argv)
+        command: Callable[[argparse.Namespace], int | None] = arguments.command
+        return command(arguments) or 0
+    except _Usage as error:
+        return _refuse(str(error))
+    except BadInput as error:
+        return _refuse(str(error))
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output went away; nothing is left to say
+        return 0
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _refuse(f"{where}{error.strerror or error}")
+    except KeyboardInterrupt:
+        return _refuse("interrupted; what was recorded so far is in the .partial.rrd file", 130)
+    except RuntimeError as error:
+        from viz_estim.recording.viewer import ViewerError
+
+        if isinstance(error, ViewerError):
+            return _refuse(str(error))
+        raise
+
+
+def entry() -> NoReturn:
+    """The console script."""
+    sys.exit(main())
+
+
+def _refuse(message: str, code: int = 2) -> int:
+    print(f"viz-estim: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+class _Usage(Exception):
+    """Wrong usage: what argparse would print in several lines."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise _Usage(f"{message} (see {self.prog} --help)")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="viz-estim", description="The debugger for state estimators.")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
+
+    def command(name: str, function: Callable[[argparse.Namespace], int | None], text: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text)
+        sub.set_defaults(command=function)
+        return sub
+
+    p = command("list", _list, "every scenario: name, one line, its parameters")
+    _json(p)
+    p = command("run", _run, "run a scenario and record it")
+    p.add_argument("scenario", metavar="SCENARIO", help="a name (see list) or FILE.py:function")
+    _inputs(p)
+    p.add_argument("--out", type=Path, metavar="FILE", help="the recording (default: recordings/SCENARIO….rrd)")
+    p.add_argument("--every", type=int, default=1, metavar="N", help="draw sigma points at every N-th step only")
+    p.add_argument("--open", action="store_true", help="open the recording when it is done")
+    p.add_argument("--live", action="store_true", help="watch it in a viewer while it runs")
+    _json(p)
+    p = command("open", _open, "open recordings in the viewer")
+    p.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    p.add_argument("--web", action="store_true", help="in a browser, served on this machine alone")
+    p = command("show", _show, "what a recording holds; with a step, every stage's numbers")
+    p.add_argument("file", type=Path, metavar="FILE")
+    _moment(p)
+    _json(p)
+    p = command("snapshot", _snapshot, "a picture of the viewer at a moment, drawn without a display")
+    p.add_argument("file", type=Path, metavar="FILE")
+    _moment(p).add_argument("--stage", type=int, metavar="N", help="place on the stage timeline")
+    p.add_argument("--size", type=_size, default=(1600, 1000), metavar="WxH")
+    p.add_argument("-o", "--out", type=Path, required=True, metavar="PNG")
+    p = command("calibrate", _calibrate, "fit sensor constants to ground truth")
+    p.add_argument("system", choices=["imu"], metavar="imu")
+    p.add_argument("--data", type=Path, action="append", required=True, metavar="PATH")
+    p.add_argument("--out", type=Path, metavar="FILE.json", help="the constants; its picture goes beside it, as .rrd")
+    _json(p)
+    p = command("export", _export, "a recording for other tools")
+    p.add_argument("file", type=Path, metavar="FILE")
+    p.add_argument("--to", required=True, choices=["tum", "csv", "npz"], metavar="tum|csv|npz")
+    p.add_argument("-o", "--out", type=Path, required=True, metavar="OUT")
+    p = command("simulate", _simulate, "write data files in the formats that the scenarios read")
+    p.add_argument("system", metavar="SYSTEM")
+    p.add_argument("--seed", type=int, default=0, metavar="N")
+    p.add_argument("--set", action="append", default=[], metavar="K=V", dest="settings")
+    p.add_argument("--out", type=Path, required=True, metavar="DIR")
+    return parser
+
+
+def _json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="one JSON object on stdout, and nothing else there")
+
+
+def _inputs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", type=Path, action="append", metavar="PATH", help="a file or folder; may repeat")
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="constants that `calibrate` wrote")
+    parser.add_argument("--set", action="append", default=[], metavar="K=V", dest="settings", help="a parameter")
+    parser.add_argument("--seed", type=int, metavar="N", help="of the simulation; with --data, of the estimator")
+
+
+def _moment(parser: argparse.ArgumentParser) -> Any:
+    moment = parser.add_mutually_exclusive_group()
+    moment.add_argument("--step", type=int, metavar="N")
+    moment.add_argument("--time", type=float, metavar="S", help="seconds from the first stamp")
+    return moment
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, x, height = text.partition("x")
+    if not (x and width.isdigit() and height.isdigit() and 200 <= int(width) <= 8192 and 200 <= int(height) <= 8192):
+        raise argparse.ArgumentTypeError(f"{text}: expected WIDTHxHEIGHT in pixels, 200 to 8192, such as 1600x1000")
+    return int(width), int(height)
+
+
+def _list(arguments: argparse.Namespace) -> None:
+    from viz_estim.running import find
+    from viz_estim.scenarios import SCENARIOS
+
+    sources = [find(name) for name in SCENARIOS]
+    _print(printing.scenarios(sources), printing.scenarios_text, arguments.json)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    from viz_estim.recording.viewer import Viewer, open_files
+    from viz_estim.running import execute, plan
+
+    if arguments.every < 1:
+        raise BadInput(f"--every {arguments.every}: expected a whole number from 1 on")
+    planned = plan(
+        arguments.scenario,
+        data=arguments.data,
+        calibration=arguments.calibration,
+        settings=arguments.settings,
+        seed=arguments.seed,
+    )
+    viewer = Viewer.start(headless=False) if arguments.live else None
+    result = execute(
+        planned,
+        arguments.out,
+        every=arguments.every,
+        live=viewer.url if viewer else None,
+        progress=_progress(),
+    )
+    if viewer:
+        viewer.detach()
+    _print(result, printing.result_text, arguments.json)
+    if arguments.open:
+        open_files([Path(result["recording"])])
+
+
+def _open(arguments: argparse.Namespace) -> None:
+    from viz_estim.recording.viewer import open_files
+
+    open_files(arguments.files, web=arguments.web)
+
+
+def _show(arguments: argparse.Namespace) -> None:
+    from viz_estim.recording.reader import load
+
+    run = load(arguments.file, points=arguments.step is not None or arguments.time is not None)
+    if arguments.step is None and arguments.time is None:
+        _print(printing.overview(run), printing.overview_text, arguments.json)
+    else:
+        row = run.row(step=arguments.step, time=arguments.time)
+        _print(printing.step(run, row), lambda shown: printing.step_text(run, shown), arguments.json)
+
+
+def _snapshot(arguments: argparse.Namespace) -> None:
+    from viz_estim.recording.reader import load
+    from viz_estim.recording.viewer import snapshot
+    from viz_estim.running import check_writable
+
+    check_writable(arguments.out, suffix=".png")
+    run = load(arguments.file, points=False)
+    if arguments.stage is not None:
+        timeline, value = "stage", run.place(arguments.stage)
+    else:
+        step, seconds = arguments.step, arguments.time
+        row = len(run.step) - 1 if step is None and seconds is None else run.row(step=step, time=seconds)
+        # A moment is shown on the timeline it was asked for; its own stamp is where a row surely lies.
+        timeline, value = ("step", int(run.step[row])) if seconds is None else ("time", float(run.time[row]))
+    for problem in snapshot(arguments.file, arguments.out, timeline=timeline, value=value, size=arguments.size):
+        print(f"viz-estim: {problem}", file=sys.stderr)
+    print(arguments.out)
+
+
+def _calibrate(arguments: argparse.Namespace) -> None:
+    from viz_estim.recording import calibration_picture
+    from viz_estim.running import check_writable
+    from viz_estim.scenarios import imu_files, imu_fit
+
+    out: Path | None = arguments.out
+    if out:
+        check_writable(out, suffix=".json")
+        check_writable(out.with_suffix(".rrd"))
+    logs = [imu_files.load(*one) for one in imu_files.find_sets(arguments.data)]
+    fitted = imu_fit.fit(logs)
+    result = fitted.to_json()
+    if out:
+        picture = out.with_suffix(".rrd")
+        calibration_picture.write(picture, fitted.pictures(), result)
+        aside = out.with_name(f".{out.name}.part")
+        aside.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        aside.replace(out)
+        result |= {"calibration": str(out), "recording": str(picture)}
+    _print(result, printing.calibration_text, arguments.json)
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from viz_estim.export import export
+    from viz_estim.recording.reader import load
+
+    for path in export(load(arguments.file), arguments.to, arguments.out):
+        print(path)
+
+
+def _simulate(arguments: argparse.Namespace) -> None:
+    import numpy as np
+
+    from viz_estim.parameters import assign, parameters
+    from viz_estim.scenarios import SYSTEMS
+
+    if arguments.system not in SYSTEMS:
+        raise BadInput(f"no system {arguments.system}{nearest(arguments.system, SYSTEMS)}")
+    if arguments.seed < 0:
+        raise BadInput(f"--seed {arguments.seed}: expected a whole number from 0 on")
+    module = SYSTEMS[arguments.system]
+    make = getattr(module, arguments.system)
+    # Here every parameter is the data's: `freeze=0` and `data.freeze=0` mean the same.
+    settings = [text.removeprefix("data.") for text in arguments.settings]
+    params, _ = assign(settings, parameters(make), {}, f"simulate {arguments.system}")
+    data = make(None, np.random.default_rng(arguments.seed), **params)
+    folder: Path = arguments.out
+    if folder.exists() and not folder.is_dir():
+        raise BadInput(f"{folder}: is a file, expected a folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in module.save(data, folder):
+        print(path)
+
+
+def _print(value: dict[str, Any], text: Callable[[Any], str], as_json: bool) -> None:
+    print(json.dumps(printing.plain(value), allow_nan=False) if as_json else text(value))
+
+
+def _progress() -> Callable[[int, int], None]:
+    """Shows a count on stderr, where that is a terminal, five times a second."""
+    if not sys.stderr.isatty():
+        return lambda done, total: None
+    last = time.monotonic()
+
+    def show(done: int, total: int) -> None:
+        nonlocal last
+        if done == total or time.monotonic() - last > 0.2:
+            last = time.monotonic()
+            print(f"\r{done}/{total} steps", end="\n" if done == total else "", file=sys.stderr, flush=True)
+
+    return show

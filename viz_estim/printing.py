@@ -1,0 +1,214 @@
+"""What commands print: JSON-ready values, and the same as text for a person."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from viz_estim.parameters import kind_text, parameters
+
+if TYPE_CHECKING:
+    from viz_estim.recording.reader import Run
+    from viz_estim.running import Source
+
+
+def plain(value: Any) -> Any:
+    """The value with arrays as lists, paths as texts, and NaN or infinity, which JSON lacks, as null."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def scenarios(sources: list[Source]) -> dict[str, Any]:
+    """Every scenario, with its parameters and those of its data."""
+    listed = []
+    for source in sources:
+        own = parameters(source.scenario)
+        data = {f"data.{k}": p for k, p in (parameters(source.data) if source.data else {}).items()}
+        listed.append(
+            {
+                "name": source.name,
+                "system": source.system,
+                "description": (source.scenario.__doc__ or "").strip().split("\n")[0],
+                "parameters": {k: {"default": p.default, "type": kind_text(p)} for k, p in {**own, **data}.items()},
+            }
+        )
+    return {"scenarios": listed}
+
+
+def scenarios_text(value: dict[str, Any]) -> str:
+    lines = []
+    for one in value["scenarios"]:
+        lines += [f"{one['name']}: {one['description']}"]
+        lines += [f"    {k}={_short(p['default'])}  ({p['type']})" for k, p in one["parameters"].items()]
+    return "\n".join([*lines, "", "viz-estim run NAME --data PATH --set K=V runs one."])
+
+
+def result_text(result: dict[str, Any]) -> str:
+    """A run's result as a person reads it; the last line is the command that opens the recording."""
+    wall = result["wall_s"]
+    lines = [
+        f"{result['scenario']}: {result['steps']} steps, {result['stages']} stages, {result['duration_s']:.2f} s of data; "
+        f"{wall['estimate']:.2f} s to estimate, {wall['record']:.2f} s to record",
+        *_figures(result),
+    ]
+    return "\n".join([*lines, f"viz-estim open {result['recording']}"])
+
+
+def _figures(result: dict[str, Any]) -> list[str]:
+    lines = []
+    if result.get("error"):
+        error = result["error"]
+        lines.append(f"FAILED at step {error['step']}, stage {error['stage']}: {error['message']}")
+    lines += [f"  {name:24} {_short(value)}" for name, value in result["metrics"].items()]
+    for sensor, nis in result["nis"].items():
+        inside = nis["low"] <= nis["mean"] <= nis["high"]
+        verdict = "inside" if inside else "above: the filter trusts it too much" if nis["mean"] > nis["high"] else (
+            "below: the filter trusts it too little")  # fmt: skip
+        lines.append(
+            f"  NIS {sensor:20} {nis['mean']:.3g} (expected {nis['dof']}; 95 % band {nis['low']:.3g} to {nis['high']:.3g}: "
+            f"{verdict})"
+        )
+    if nees := result["nees"]:
+        lines.append(
+            f"  NEES                     {nees['mean']:.3g} (expected {nees['dof']}; {nees['inside']:.0%} of the steps "
+            "inside their 95 % interval)"
+        )
+    return lines
+
+
+def overview(run: Run) -> dict[str, Any]:
+    """What a recording holds."""
+    facts = run.properties
+    return {
+        "recording": str(run.path),
+        "complete": run.complete,
+        "scenario": facts.get("scenario"),
+        "params": facts.get("params", {}),
+        "seed": facts.get("seed"),
+        "data": facts.get("data", []),
+        "calibration": facts.get("calibration"),
+        "versions": facts.get("versions", {}),
+        "steps": len(run.step),
+        "first_step": int(run.step[0]),
+        "last_step": int(run.step[-1]),
+        "duration_s": float(run.time[-1] - run.time[0]),
+        "stages": {name: len(table.step) for name, table in run.stages.items()},
+        "state": dict(zip(run.space.names, run.space.units, strict=True)),
+        "inputs": list(run.inputs),
+        "error": run.error if run.complete is False else (facts["result"] or {}).get("error"),
+        **run.summary(),
+    }
+
+
+def overview_text(value: dict[str, Any]) -> str:
+    ended = "" if value["complete"] else " (the run was cut off: this is what it had recorded)"
+    lines = [
+        f"{value['recording']}: {value['scenario']}, {value['steps']} steps over {value['duration_s']:.2f} s{ended}",
+        f"  stages: {', '.join(f'{name} {count}' for name, count in value['stages'].items())}",
+        f"  state:  {', '.join(f'{k} [{u}]' if u else k for k, u in value['state'].items())}",
+        f"  data:   {', '.join(d['path'] for d in value['data']) or 'simulated'}, seed {value['seed']}",
+        f"  set:    {', '.join(f'{k}={_short(v)}' for k, v in value['params'].items())}",
+        *_figures(value | {"error": value["error"] if isinstance(value["error"], dict) else None}),
+        f"viz-estim show {value['recording']} --step {value['last_step']}",
+    ]
+    return "\n".join(lines)
+
+
+def step(run: Run, row: int) -> dict[str, Any]:
+    """One step: every stage's belief and numbers, the inputs, the truth."""
+    number = int(run.step[row])
+    stages = []
+    for table, at in run.at(number):
+        numbers = {name: values[at] for name, values in table.values.items() if name not in ("mean", "cov")}
+        stages.append(
+            {"name": table.name, "stage": int(table.place[at]), "belief": {"mean": table.mean[at], "cov": table.cov[at]}}
+            | {name: value for name, value in numbers.items() if not np.isnan(value).all()}
+        )
+    result = run.properties.get("result") or {}
+    error = result.get("error") if number == run.step[-1] else None
+    truth = run.truth[row]
+    return {
+        "step": number,
+        "time": float(run.time[row]),
+        "dt": float(run.dt[row]),
+        "stages": stages,
+        "truth": truth if np.isfinite(truth).any() else None,
+        "inputs": {name: values[row] for name, values in run.inputs.items()},
+        "error": error,
+    }
+
+
+def step_text(run: Run, value: dict[str, Any]) -> str:
+    lines = [f"step {value['step']} at {value['time']:.4f} s (dt {value['dt']:.4f} s)"]
+    lines += [f"  {name:18} {_row(numbers)}" for name, numbers in value["inputs"].items()]
+    if value["truth"] is not None:
+        lines.append(f"  {'truth':18} {_row(value['truth'])}")
+    for stage in value["stages"]:
+        lines.append(f"{stage['name']}  (stage {stage['stage']})")
+        mean, cov = stage["belief"]["mean"], stage["belief"]["cov"]
+        lines.append(f"  {'mean':18} {_named(run.space.names, mean, run.space.units)}")
+        sigma = np.sqrt(np.maximum(np.diagonal(cov), 0))
+        lines.append(f"  {'σ':18} {_named(run.space.axes, sigma, run.space.axis_units)}")
+        table = run.stages[stage["name"]]
+        for name, numbers in stage.items():
+            if name in ("name", "stage", "belief"):
+                continue
+            space = table.spaces.get(name.partition(".")[0])
+            if name.endswith((".residual", ".z", ".predicted")) and space is not None:
+                names, units = (space.axes, space.axis_units) if name.endswith("residual") else (space.names, space.units)
+                lines.append(f"  {name:18} {_named(names, numbers, units)}")
+            elif numbers.ndim == 1:
+                lines.append(f"  {name:18} {_row(numbers)}")
+            else:
+                lines.append(f"  {name:18} {'×'.join(map(str, numbers.shape))} (see --json)")
+    if value["error"]:
+        lines.append(f"FAILED in {value['error']['stage']}: {value['error']['message']}")
+    return "\n".join(lines)
+
+
+def calibration_text(value: dict[str, Any]) -> str:
+    lines = []
+    for sensor, unit in (("accel", "mps2"), ("gyro", "radps")):
+        fitted = value[sensor]
+        lines.append(f"{sensor}:            {'x':>18}{'y':>18}{'z':>18}")
+        for label, key, error in (
+            ("bias [counts]", "bias_counts", "bias_se"),
+            (f"sensitivity [mV/{'(m/s²)' if unit == 'mps2' else '(rad/s)'}]", f"sensitivity_mv_per_{unit}", "sensitivity_se"),
+        ):
+            cells = "".join(f"{f'{v:.3f} ± {e:.3f}':>18}" for v, e in zip(fitted[key], fitted[error], strict=True))
+            lines.append(f"  {label}\n{'':18}{cells}")
+    for one in value["sets"]:
+        lines.append(
+            f"{one['files'][0]['name']}: motion capture's stamps are {1e3 * one['time_offset_s']:+.1f} ± "
+            f"{1e3 * one['time_offset_se']:.1f} ms late; {one['windows']} windows, {one['frozen']} frozen samples left out"
+        )
+    if "calibration" in value:
+        lines += [
+            f"viz-estim run imu-ukf --data PATH --calibration {value['calibration']}",
+            f"viz-estim open {value['recording']}",
+        ]
+    return "\n".join(lines)
+
+
+def _named(names: tuple[str, ...], values: Any, units: tuple[str, ...]) -> str:
+    return "  ".join(f"{n}={_short(v)}{f' {u}' if u else ''}" for n, v, u in zip(names, values, units, strict=True))
+
+
+def _row(values: Any) -> str:
+    return "  ".join(_short(v) for v in np.atleast_1d(values))
+
+
+def _short(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, (float, np.floating)) else str(value)
