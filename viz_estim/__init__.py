@@ -28,16 +28,14 @@ def estimate_rot(
     params are the scenario's own (`gyro_noise=…`, `frozen="reject"`, the default here). Raises ArithmeticError with
     the step where the filter failed.
     """
-    from viz_estim.core import quaternions
-    from viz_estim.core.run import run
-    from viz_estim.scenarios import imu
-
-    data = imu.prepare(
-        imu.imu_files.load(Path(imu_file), None), Path(calibration) if calibration is not None else None
-    )
-    scenario = imu.imu_ukf(data, **({"frozen": "reject"} | params))
     import numpy as np
 
+    from viz_estim.core import quaternions
+    from viz_estim.core.run import run
+    from viz_estim.scenarios import imu, imu_data, imu_files
+
+    data = imu_data.prepare(imu_files.load(Path(imu_file), None), None if calibration is None else Path(calibration))
+    scenario = imu.imu_ukf(data, **({"frozen": "reject"} | params))
     attitudes = []
     for step in run(scenario):
         if step.error:

@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 
 from viz_estim import printing
 from viz_estim.errors import BadInput
+from viz_estim.files import check_writable, whole
 from viz_estim.parameters import nearest
 
 
@@ -189,17 +190,17 @@ def _show(arguments: argparse.Namespace) -> None:
 def _snapshot(arguments: argparse.Namespace) -> None:
     from viz_estim.recording.reader import load
     from viz_estim.recording.viewer import snapshot
-    from viz_estim.running import check_writable
 
     check_writable(arguments.out, suffix=".png")
     run = load(arguments.file, points=False)
     if arguments.stage is not None:
-        timeline, value = "stage", run.place(arguments.stage)
+        moment: tuple[str, float] = ("stage", run.place(arguments.stage))
     else:
         step, seconds = arguments.step, arguments.time
         row = len(run.step) - 1 if step is None and seconds is None else run.row(step=step, time=seconds)
         # A moment is shown on the timeline it was asked for; its own stamp is where a row surely lies.
-        timeline, value = ("step", int(run.step[row])) if seconds is None else ("time", float(run.time[row]))
+        moment = ("step", int(run.step[row])) if seconds is None else ("time", float(run.time[row]))
+    timeline, value = moment
     for problem in snapshot(arguments.file, arguments.out, timeline=timeline, value=value, size=arguments.size):
         print(f"viz-estim: {problem}", file=sys.stderr)
     print(arguments.out)
@@ -207,7 +208,6 @@ def _snapshot(arguments: argparse.Namespace) -> None:
 
 def _calibrate(arguments: argparse.Namespace) -> None:
     from viz_estim.recording import calibration_picture
-    from viz_estim.running import check_writable
     from viz_estim.scenarios import imu_files, imu_fit
 
     out: Path | None = arguments.out
@@ -220,9 +220,8 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     if out:
         picture = out.with_suffix(".rrd")
         calibration_picture.write(picture, fitted.pictures(), result)
-        aside = out.with_name(f".{out.name}.part")
-        aside.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-        aside.replace(out)
+        with whole(out) as aside:
+            aside.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
         result |= {"calibration": str(out), "recording": str(picture)}
     _print(result, printing.calibration_text, arguments.json)
 
@@ -231,6 +230,7 @@ def _export(arguments: argparse.Namespace) -> None:
     from viz_estim.export import export
     from viz_estim.recording.reader import load
 
+    check_writable(arguments.out)
     for path in export(load(arguments.file), arguments.to, arguments.out):
         print(path)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
@@ -14,6 +13,7 @@ from viz_estim.core.consistency import nees, nis
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, SO3, Euclidean, Product
 from viz_estim.errors import BadInput
+from viz_estim.files import whole
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.reader import Run
 
@@ -46,7 +46,8 @@ def _write_tum(path: Path, run: Run, states: Array) -> Path:
         elif isinstance(part, Euclidean) and name == "position":
             position[:, : x.shape[1]], posed = x[:, :3], True
     if not posed:
-        raise BadInput(f"{run.path}: no attitude, pose or position in its state ({', '.join(space.parts)}); use --to csv")
+        parts = ", ".join(space.parts)
+        raise BadInput(f"{run.path}: no attitude, pose or position in its state ({parts}); use --to csv")
     known = np.isfinite(position).all(1) & np.isfinite(attitude).all(1)
     rows = np.concatenate([run.time[:, None], position, attitude[:, [1, 2, 3, 0]]], axis=1)[known]
     return _whole(path, lambda file: np.savetxt(file, rows, fmt="%.9f"))
@@ -102,12 +103,7 @@ def _write_csv(file: IO[str], names: tuple[str, ...], rows: Array) -> None:
 
 
 def _whole(path: Path, write: Callable[[Any], object], *, text: bool = False) -> Path:
-    """Writes beside the file and then takes its name, so that a failure leaves what was there."""
-    aside = path.with_name(f".{path.name}.part")
-    try:
-        with aside.open("w" if text else "wb", **({"newline": "", "encoding": "utf-8"} if text else {})) as file:
-            write(file)
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
+    how: dict[str, Any] = {"mode": "w", "newline": "", "encoding": "utf-8"} if text else {"mode": "wb"}
+    with whole(path) as aside, aside.open(**how) as file:
+        write(file)
     return path

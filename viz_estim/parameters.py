@@ -65,7 +65,7 @@ def assign(
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """"; did you mean X?", or the names there are."""
+    """ "; did you mean X?", or the names there are."""
     known = list(names)
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     if close:

@@ -59,8 +59,8 @@ def result_text(result: dict[str, Any]) -> str:
     """A run's result as a person reads it; the last line is the command that opens the recording."""
     wall = result["wall_s"]
     lines = [
-        f"{result['scenario']}: {result['steps']} steps, {result['stages']} stages, {result['duration_s']:.2f} s of data; "
-        f"{wall['estimate']:.2f} s to estimate, {wall['record']:.2f} s to record",
+        f"{result['scenario']}: {result['steps']} steps, {result['stages']} stages, {result['duration_s']:.2f} s of "
+        f"data; {wall['estimate']:.2f} s to estimate, {wall['record']:.2f} s to record",
         *_figures(result),
     ]
     return "\n".join([*lines, f"viz-estim open {result['recording']}"])
@@ -77,8 +77,8 @@ def _figures(result: dict[str, Any]) -> list[str]:
         verdict = "inside" if inside else "above: the filter trusts it too much" if nis["mean"] > nis["high"] else (
             "below: the filter trusts it too little")  # fmt: skip
         lines.append(
-            f"  NIS {sensor:20} {nis['mean']:.3g} (expected {nis['dof']}; 95 % band {nis['low']:.3g} to {nis['high']:.3g}: "
-            f"{verdict})"
+            f"  NIS {sensor:20} {nis['mean']:.3g} (expected {nis['dof']}; 95 % band {nis['low']:.3g} to "
+            f"{nis['high']:.3g}: {verdict})"
         )
     if nees := result["nees"]:
         lines.append(
@@ -133,7 +133,8 @@ def step(run: Run, row: int) -> dict[str, Any]:
     for table, at in run.at(number):
         numbers = {name: values[at] for name, values in table.values.items() if name not in ("mean", "cov")}
         stages.append(
-            {"name": table.name, "stage": int(table.place[at]), "belief": {"mean": table.mean[at], "cov": table.cov[at]}}
+            {"name": table.name, "stage": int(table.place[at])}
+            | {"belief": {"mean": table.mean[at], "cov": table.cov[at]}}
             | {name: value for name, value in numbers.items() if not np.isnan(value).all()}
         )
     result = run.properties.get("result") or {}
@@ -167,7 +168,8 @@ def step_text(run: Run, value: dict[str, Any]) -> str:
                 continue
             space = table.spaces.get(name.partition(".")[0])
             if name.endswith((".residual", ".z", ".predicted")) and space is not None:
-                names, units = (space.axes, space.axis_units) if name.endswith("residual") else (space.names, space.units)
+                along = name.endswith("residual")
+                names, units = (space.axes, space.axis_units) if along else (space.names, space.units)
                 lines.append(f"  {name:18} {_named(names, numbers, units)}")
             elif numbers.ndim == 1:
                 lines.append(f"  {name:18} {_row(numbers)}")
@@ -180,19 +182,20 @@ def step_text(run: Run, value: dict[str, Any]) -> str:
 
 def calibration_text(value: dict[str, Any]) -> str:
     lines = []
-    for sensor, unit in (("accel", "mps2"), ("gyro", "radps")):
+    for sensor, unit, shown in (("accel", "mps2", "m/s²"), ("gyro", "radps", "rad/s")):
         fitted = value[sensor]
         lines.append(f"{sensor}:            {'x':>18}{'y':>18}{'z':>18}")
         for label, key, error in (
             ("bias [counts]", "bias_counts", "bias_se"),
-            (f"sensitivity [mV/{'(m/s²)' if unit == 'mps2' else '(rad/s)'}]", f"sensitivity_mv_per_{unit}", "sensitivity_se"),
+            (f"sensitivity [mV/({shown})]", f"sensitivity_mv_per_{unit}", "sensitivity_se"),
         ):
             cells = "".join(f"{f'{v:.3f} ± {e:.3f}':>18}" for v, e in zip(fitted[key], fitted[error], strict=True))
             lines.append(f"  {label}\n{'':18}{cells}")
     for one in value["sets"]:
         lines.append(
             f"{one['files'][0]['name']}: motion capture's stamps are {1e3 * one['time_offset_s']:+.1f} ± "
-            f"{1e3 * one['time_offset_se']:.1f} ms late; {one['windows']} windows, {one['frozen']} frozen samples left out"
+            f"{1e3 * one['time_offset_se']:.1f} ms late; {one['windows']} windows, {one['frozen']} frozen samples "
+            "left out"
         )
     if "calibration" in value:
         lines += [

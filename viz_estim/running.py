@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import inspect
 import platform
@@ -20,8 +19,9 @@ import numpy as np
 from viz_estim.core.consistency import Tally
 from viz_estim.core.run import Scenario, Step, run
 from viz_estim.errors import BadInput
+from viz_estim.files import check_writable, sha256
 from viz_estim.parameters import assign, nearest, parameters
-from viz_estim.recording.recorder import Recorder, partial_of
+from viz_estim.recording.recorder import Recorder
 from viz_estim.scenarios import SCENARIOS, SYSTEMS
 
 Progress = Callable[[int, int], None]
@@ -114,7 +114,7 @@ def plan(
         if own.is_dir():
             data = [own]
     if data and source.data and (changed := [k for k, v in data_params.items() if v != data_parameters[k].default]):
-        raise BadInput(f"data.{changed[0]} belongs to the simulation; leave it out, or leave out --data and give --seed")
+        raise BadInput(f"data.{changed[0]} belongs to the simulation; leave it out, or give --seed instead of --data")
     return Plan(source, params, data_params, data or None, calibration, seed or 0)
 
 
@@ -140,7 +140,8 @@ def _import(path: Path) -> Any:
     if not path.is_file():
         raise BadInput(f"{path}: no such file")
     spec = importlib.util.spec_from_file_location(f"viz_estim_user_{path.stem}", path)
-    assert spec and spec.loader
+    assert spec
+    assert spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     sys.path.insert(0, str(path.parent.resolve()))
@@ -164,7 +165,9 @@ def _data_function(module: Any, scenario: Callable[..., Any], name: str) -> Call
     matching = [f for f in makers if typing.get_type_hints(f).get("return") is wanted and wanted is not None]
     chosen = matching or makers
     if len(chosen) != 1:
-        raise BadInput(f"{name}: takes data, and its file has {len(chosen)} functions (source, rng, …) that make it, not 1")
+        raise BadInput(
+            f"{name}: takes data; its file needs one function (source, rng, …) that makes it, not {len(chosen)}"
+        )
     return chosen[0]
 
 
@@ -208,35 +211,11 @@ def execute(planned: Plan, out: Path | None, *, every: int, live: str | None, pr
     """Runs a plan and records it; returns what `run --json` prints."""
     scenario = planned.build()
     path = out or Path("recordings") / f"{planned.title()}.rrd"
-    check_writable(path, make_folder=out is None)
+    if out is None:
+        path.parent.mkdir(exist_ok=True)
+    check_writable(path, suffix=".rrd")
     properties = planned.properties(scenario)
     with Recorder(path, scenario, properties, every=every, live=live) as recorder:
         result, _ = recorded(run(scenario, planned.seed), scenario, recorder, progress)
     head = {"scenario": planned.source.name, "recording": str(path)}
     return head | {"params": planned.all_params(), "seed": planned.seed} | result
-
-
-def check_writable(path: Path, *, make_folder: bool = False, suffix: str = ".rrd") -> None:
-    """BadInput where a file cannot be written, before any work is done; nothing that exists is touched."""
-    if path.suffix != suffix:
-        raise BadInput(f"{path}: the output's name must end in {suffix}")
-    if make_folder and not path.parent.exists():
-        path.parent.mkdir(parents=True)
-    if not path.parent.is_dir():
-        raise BadInput(f"{path}: the folder {path.parent} does not exist; make it first")
-    if path.is_dir():
-        raise BadInput(f"{path}: is a folder, expected a file's name")
-    probe = partial_of(path)
-    existed = probe.exists()
-    try:
-        with probe.open("ab"):
-            pass
-    except OSError as error:
-        raise BadInput(f"{path}: cannot be written ({error.strerror})") from error
-    if not existed:
-        probe.unlink()
-
-
-def sha256(path: Path) -> str:
-    """The file's SHA-256 in hexadecimal."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()

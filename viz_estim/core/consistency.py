@@ -179,5 +179,5 @@ class Tally:
             (rows[0].space, *(np.stack([getattr(row, k) for row in rows]) for k in ("residual", "cov", "offered")))
             for rows in self.innovations.values()
         ]
-        stacked = [np.stack(values) if values else np.empty(0) for values in (self.means, self.covs, self.truths)]
-        return summary(self.space, *stacked, innovations)
+        mean, cov, truth = (np.stack(rows) if rows else np.empty(0) for rows in (self.means, self.covs, self.truths))
+        return summary(self.space, mean, cov, truth, innovations)

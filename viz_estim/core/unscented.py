@@ -61,7 +61,7 @@ def draw(space: Space, mean: Array, cov: Array, rule: Rule) -> SigmaPoints:
 
 
 def moments(sigma: SigmaPoints) -> tuple[Array, Array, Array]:
-    """Mean (*, n), covariance (*, d, d) and the error vectors (*, N, d) of sigma points (Kraft 2003, eqs. 52–55, 64)."""
+    """Mean (*, n), covariance (*, d, d) and error vectors (*, N, d) of sigma points (Kraft 2003, eqs. 52–55, 64)."""
     mean = sigma.space.mean(sigma.points, sigma.mean_weights)
     errors = sigma.space.minus(sigma.points, mean[..., None, :])
     return mean, _transposed(errors) @ (sigma.cov_weights[:, None] * errors), errors

@@ -45,7 +45,7 @@ def _scenes(layout: Layout) -> list[_Item]:
     views = [
         _scene(
             schema.sensor(name),
-            f"{name} in body axes{_unit(space)}: measured {schema.sensor_colour(layout.place(name))[0]}, predicted amber",
+            f"{name}, body axes{_unit(space)}: measured {schema.sensor_colour(layout.place(name))[0]}, predicted amber",
             layout.reach.get(name, 1.0),
         )
         for name, space in sensors

@@ -53,7 +53,7 @@ def _descriptor(archetype: str, component: str) -> rr.ComponentDescriptor:
 
 
 def numbers(archetype: str, component: str, rows: Sequence[Array | None]) -> rr.ComponentColumn:
-    """Float64 arrays as one column, bit for bit, row-major; a row that is None or of another length may be among them."""
+    """Float64 arrays as one column, bit for bit, row-major; rows may be None or of several lengths."""
     descriptor = _descriptor(archetype, component)
     sizes = {-1 if row is None else row.size for row in rows}
     if len(sizes) == 1 and -1 not in sizes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import rerun as rr
@@ -168,7 +169,7 @@ class Drawing:
             half_sizes=np.tile(self._body, (len(R), 1)), quaternions=xyzw(q[known])
         ), known.astype(int))  # fmt: skip
         tips = reach * np.swapaxes(R, -1, -2).reshape(-1, 3)
-        self._send(axes, at, rr.Arrows3D.columns(vectors=tips), 3 * known)
+        self._send(axes, at, rr.Arrows3D.columns(vectors=tips), 3 * known.astype(int))
 
     def _draw_stages(self, at: Times, stages: list[Stage], every: int) -> None:
         """Innovations of every stage, and its sigma points at every N-th step."""
@@ -195,7 +196,8 @@ class Drawing:
                 tips = np.swapaxes(quaternions.to_matrix(x), -1, -2).reshape(-1, 3)
                 count = 3 * points.shape[1]
                 faint = 0.55 if field == "drawn" else 1.0  # what a prediction starts from stands back
-                colours = [tuple(int(faint * v) for v in schema.AXES[i % 3]) for i in range(count)]
+                shades = (faint * np.array(schema.AXES)).astype(int)
+                colours: list[schema.Colour] = [tuple(shades[i % 3]) for i in range(count)]
                 self._geometry(
                     stage, schema.drawn(stage, field), at, "points", tips, count, colours, 0.014 / faint**0.5
                 )
@@ -265,7 +267,7 @@ class Drawing:
                     absent.setdefault(name, []).append(row)
                 elif name == self._last_stage and name != names[0]:
                     within.setdefault(name, []).append(place)
-            for i, (name, after) in enumerate(zip(drawn, drawn[1:], strict=False)):
+            for i, (name, after) in enumerate(pairwise(drawn)):
                 if name != after:
                     within.setdefault(name, []).append(place + i + 1)
             self._last, self._last_stage = drawn, names[-1] if names else ""

@@ -74,7 +74,7 @@ class Run:
         return [(table, row) for _, table, row in sorted(found, key=lambda entry: entry[0])]
 
     def row(self, *, step: int | None = None, time: float | None = None) -> int:
-        """The row of a step by its number, or of the last step at or before a time (s). BadInput where there is none."""
+        """The row of a step by its number, or of the last one at or before a time (s). BadInput where there is none."""
         if step is not None:
             rows = np.flatnonzero(self.step == step)
             if not len(rows):
@@ -137,8 +137,9 @@ def load(path: str | Path, *, points: bool = True) -> Run:
     index = steps.index()
     inputs = {name: steps.column(name, (-1,)) for name in steps.names() if name not in ("dt", "truth")}
     truth = steps.column("truth", (len(space.names),))
-    known = [name for name in facts.get("stages", {}) if name in stages] + [s for s in stages if s not in facts["stages"]]
-    tables = {name: _table(name, stages[name], space, facts["stages"].get(name, {})) for name in known}
+    fields = facts.get("stages", {})
+    known = [*(name for name in fields if name in stages), *(name for name in stages if name not in fields)]
+    tables = {name: _table(name, stages[name], space, fields.get(name, {})) for name in known}
     mean, cov = _ends(index["step"], tables, space)
     return Run(
         path, facts, space, index["step"], index["time"], steps.column("dt", ()), truth, inputs, tables, mean, cov,
@@ -170,9 +171,8 @@ class _Gathered:
         if "step" not in batch.schema.names:
             return
         nanoseconds = batch.column("time").cast(pa.int64()).to_numpy()
-        self.times.append(
-            {"step": batch.column("step").to_numpy(), "stage": batch.column("stage").to_numpy(), "time": nanoseconds / 1e9}
-        )
+        times = {name: batch.column(name).to_numpy() for name in ("step", "stage")}
+        self.times.append(times | {"time": nanoseconds / 1e9})
         for name in batch.schema.names:
             component = name.partition(":")[2]
             if component and (self._points or not component.endswith(".points")):

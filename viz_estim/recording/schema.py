@@ -72,27 +72,50 @@ class Entry(NamedTuple):
 
     path: str
     holds: str
-    unit: str
-    frame: str
+    unit: str = ""
+    frame: str = ""
 
 
+_SENSOR_S, _PART_S, _TANGENT = "the sensor's", "the part's", "body (tangent at the estimate)"
 ENTITIES = (
-    Entry(STEPS, "`viz_estim.Step`: dt, truth, control, and of each sensor `z.<sensor>`, `raw.<sensor>`", "as the scenario's spaces say", ""),
-    Entry("/stages/{stage}", "`viz_estim.Stage`: mean, cov, and the stage's own numbers (`gain`, `innovation.residual`, `sigma.points`, …), float64, row-major", "SI, radians", "covariances in the tangent space at the mean (body)"),
-    Entry("/world/estimate, /world/truth", "`Boxes3D`, `Arrows3D`: the body and its axes", "box not to scale", "world, z up"),
-    Entry("/world/{stage}/{points}", "`Points3D`: sigma points of an attitude, as tips of the body's axes (x red, y green, z blue)", "unit sphere", "world"),
-    Entry("/sensors/{sensor}/mapped", "`Points3D`: sigma points in the sensor's space", "the sensor's", "body"),
-    Entry("/sensors/{sensor}/measured, …/predicted", "`Arrows3D`: the reading, and the mean of what was expected", "the sensor's", "body"),
-    Entry("/plots/state/{part}.{component}", "`Measurements`: estimate with its ±1σ band, truth, and the sensor that reads it", "the part's", "the part's"),
-    Entry("/plots/error/{part}.{axis}", "`Measurements`: the error within ±3σ of the covariance", "deg or the part's", "body (tangent at the estimate)"),
-    Entry("/plots/sigma/{part}", "`Measurements`: √ of the covariance's diagonal", "deg or the part's", "body (tangent at the estimate)"),
-    Entry("/plots/innovation/{sensor}.{axis}", "`Measurements`: the residual within ±3σ of S", "the sensor's", "body"),
-    Entry("/plots/nis/{sensor}", "`Measurements`: normalised innovation squared, with χ²'s 95 % interval", "1", ""),
-    Entry("/lanes/stage, /lanes/{sensor}", "`StateChange`: the stage; whether a sensor was used, gated, frozen or absent", "", ""),
-    Entry(EVENTS, "`TextLog`: what ended a run", "", ""),
-    Entry(NOTES, "`TextDocument`: what to look at", "", ""),
-    Entry("/__properties/viz_estim", "scenario, parameters, seed, data files with sha256, versions, spaces, the run's result (JSON texts)", "", ""),
-)  # fmt: skip
+    Entry(
+        STEPS, "`viz_estim.Step`: dt, truth, control; of each sensor `z.<sensor>` and `raw.<sensor>`", "SI, rad; counts"
+    ),
+    Entry(
+        "/stages/{stage}",
+        "`viz_estim.Stage`: mean, cov and the stage's own numbers (`gain`, `innovation.residual`, `sigma.points`, …), "
+        "float64, row-major",
+        "SI, rad",
+        "covariances: " + _TANGENT,
+    ),
+    Entry("/world/estimate, /world/truth", "`Boxes3D`, `Arrows3D`: the body and its axes", "not to scale", "world"),
+    Entry(
+        "/world/{stage}/{points}", "`Points3D`: an attitude's sigma points, as tips of the body's axes", "1", "world"
+    ),
+    Entry("/sensors/{sensor}/mapped", "`Points3D`: sigma points mapped into the measurement", _SENSOR_S, "body"),
+    Entry("/sensors/{sensor}/measured", "`Arrows3D`: the reading", _SENSOR_S, "body"),
+    Entry("/sensors/{sensor}/predicted", "`Arrows3D`: the mean of what was expected", _SENSOR_S, "body"),
+    Entry(
+        "/plots/state/{part}.{component}",
+        "`Measurements`: the estimate with its ±1σ band, the truth, the sensor that reads it",
+        _PART_S,
+        _PART_S,
+    ),
+    Entry(
+        "/plots/error/{part}.{axis}", "`Measurements`: the error, ±3σ of the covariance", "deg, " + _PART_S, _TANGENT
+    ),
+    Entry("/plots/sigma/{part}", "`Measurements`: √ of the covariance's diagonal", "deg, " + _PART_S, _TANGENT),
+    Entry("/plots/innovation/{sensor}.{axis}", "`Measurements`: the residual, ±3σ of S", _SENSOR_S, "body"),
+    Entry("/plots/nis/{sensor}", "`Measurements`: normalised innovation squared, χ²'s 95 % interval", "1"),
+    Entry("/lanes/stage", "`StateChange`: the stage"),
+    Entry("/lanes/{sensor}", "`StateChange`: its reading was used, gated, frozen or absent"),
+    Entry(EVENTS, "`TextLog`: what ended a run"),
+    Entry(NOTES, "`TextDocument`: what to look at"),
+    Entry(
+        "/__properties/viz_estim",
+        "scenario, parameters, seed, data files with their SHA-256, versions, spaces, the result (JSON texts)",
+    ),
+)
 
 
 def table() -> str:

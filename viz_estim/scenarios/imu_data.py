@@ -16,6 +16,8 @@ from viz_estim.scenarios.imu_health import frozen_gyro, still_prefix
 
 _TRUTH_GAP = 0.1  # s: across a longer gap the truth is not interpolated
 
+_HANDS_ON = 2.0  # s before the motion is seen; of a short prefix, its second half
+
 
 @dataclass(frozen=True)
 class ImuData:
@@ -36,26 +38,45 @@ class ImuData:
 
 
 def prepare(log: ImuLog, calibration: Path | None) -> ImuData:
-    """The log in SI units, its still prefix and freezes found, the truth brought to its stamps."""
+    """The log in SI units, its still prefix and freezes found, the truth brought to its stamps.
+
+    The gyro's bias is read off the data's own rest, also beside a calibration: it wanders by a tenth of a count from
+    set to set, which is 3° after half a minute. Only where there is no rest are the constants' own biases taken.
+    """
+    offset = 0.0
     if log.in_counts:
         constants = imu_calibration.DOCUMENTED if calibration is None else imu_calibration.load(calibration)
+        offset = constants.truth_offset(log.files)
         accel = constants.accel(log.accel)
-        typical = constants.with_gyro_bias(imu_calibration.TYPICAL_GYRO_BIAS)
-        still = still_prefix(log.stamps, typical.gyro(log.gyro), accel)
-        if constants.gyro_bias is None:
-            # The mean, not the median: counts are whole numbers, and half a count is 10° after half a minute.
-            constants = constants.with_gyro_bias(log.gyro[:still].mean(0)) if still else typical
+        still = still_prefix(log.stamps, constants.gyro(log.gyro), accel)
+        if still:
+            constants = constants.with_gyro_bias(resting_gyro(log, still))
         gyro = constants.gyro(log.gyro)
     else:
         if calibration is not None:
             raise BadInput(f"{log.files[0]}: is in SI units; a calibration is for counts (.mat), leave it out")
         still = still_prefix(log.stamps, log.gyro, log.accel)
-        gyro = log.gyro - log.gyro[:still].mean(0) if still else log.gyro
+        gyro = log.gyro - resting_gyro(log, still) if still else log.gyro
         accel = log.accel
     frozen = frozen_gyro(log.stamps, gyro, accel, np.zeros(3))
-    truth = truth_at(log.stamps, log)
+    truth = truth_at(log.stamps, log, offset)
     time = log.stamps - log.stamps[0]
-    return ImuData(time, gyro, accel, truth, frozen, still, log, _describe(time, truth, frozen, still))
+    notes = _describe(time, truth, frozen, still)
+    if offset:
+        notes += f" The truth's stamps are {1e3 * offset:.0f} ms late, by the calibration, and corrected."
+    return ImuData(time, gyro, accel, truth, frozen, still, log, notes)
+
+
+def resting_gyro(log: ImuLog, still: int) -> Array:
+    """What the gyro (3,) reads at rest: its mean over the still prefix, but for the end, when a hand takes hold.
+
+    The mean, not the median: counts are whole numbers, and the median's error of up to half a count is 10° after half
+    a minute.
+    """
+    end = log.stamps[still - 1]
+    untouched = log.stamps <= max(end - _HANDS_ON, 0.5 * (log.stamps[0] + end))
+    mean: Array = log.gyro[untouched].mean(0)
+    return mean
 
 
 def truth_at(stamps: Array, log: ImuLog, offset: float = 0.0) -> Array:

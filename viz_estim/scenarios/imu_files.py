@@ -67,7 +67,8 @@ def load(imu: Path, truth: Path | None) -> ImuLog:
     stamps = _stamps(columns["time"], imu, "time")
     values = {c: _finite(columns[c], imu, c) for c in _CHANNELS}
     gyro, accel = (np.stack([values[f"{kind}_{axis}"] for axis in "xyz"], axis=1) for kind in ("gyro", "accel"))
-    files, reference = (imu,), (np.empty(0), np.empty((0, 4)))
+    files: tuple[Path, ...] = (imu,)
+    reference = np.empty(0), np.empty((0, 4))
     if truth is not None:
         files, reference = (imu, truth), _load_truth(truth)
     elif any(c in columns for c in _QUATERNION):

@@ -10,7 +10,6 @@ from viz_estim.scenarios.imu_calibration import (
     ACCEL_SIGNS,
     DOCUMENTED,
     MV_PER_COUNT,
-    TYPICAL_GYRO_BIAS,
     Calibration,
 )
 from viz_estim.scenarios.imu_files import ImuLog
@@ -37,7 +36,6 @@ def simulate(
     stamps = _stamps(rng, duration, 0.0096, 0.0012)
     at = np.minimum((stamps / _FINE).astype(int), len(grid) - 1)
     gravity = quaternions.rotate(quaternions.conjugate(attitude[at]), np.array([0.0, 0.0, GRAVITY]))
-    assert constants.gyro_bias is not None
     gyro = constants.gyro_bias + rate[at] * constants.gyro_sensitivity / MV_PER_COUNT
     accel = constants.accel_bias + ACCEL_SIGNS * (gravity + push[at]) * constants.accel_sensitivity / MV_PER_COUNT
     gyro = _counts(gyro + noise_scale * 0.5 * rng.standard_normal(gyro.shape))
@@ -62,7 +60,7 @@ def _constants(rng: np.random.Generator) -> Calibration:
         accel_bias=DOCUMENTED.accel_bias + rng.uniform(-0.5, 0.5, 3),
         accel_sensitivity=DOCUMENTED.accel_sensitivity * rng.uniform(0.99, 1.01, 3),
         gyro_sensitivity=DOCUMENTED.gyro_sensitivity * rng.uniform(0.98, 1.02, 3),
-        gyro_bias=TYPICAL_GYRO_BIAS + rng.uniform(-0.5, 0.5, 3),
+        gyro_bias=DOCUMENTED.gyro_bias + rng.uniform(-0.5, 0.5, 3),
     )
 
 
@@ -89,7 +87,7 @@ def _hand(grid: Array, rng: np.random.Generator, still: float, duration: float) 
 
 
 def _tilted_start(rng: np.random.Generator) -> Array:
-    return quaternions.from_euler(np.array([*rng.normal(0, 0.03, 2), rng.normal(0, 0.3)]))
+    return quaternions.from_euler(np.array([*rng.normal(0, 0.03, 2), rng.normal(0, 0.05)]))
 
 
 def _integrate(rate: Array, start: Array) -> Array:
