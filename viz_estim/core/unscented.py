@@ -178,7 +178,7 @@ def update(
     R = measurement.noise if noise is None else noise
     predicted, spread, errors = moments(mapped)
     S = _symmetrised(spread + R)
-    state_errors = belief.space.minus(sigma.points, belief.mean[..., None, :])
+    state_errors: Array = belief.space.minus(sigma.points, belief.mean[..., None, :])
     C = _transposed(state_errors) @ (sigma.cov_weights[:, None] * errors)
     residual = measurement.space.minus(z, predicted)
     used = measurement.passes(residual, S)
@@ -199,7 +199,8 @@ def _gain(C: Array, S: Array, used: np.ndarray) -> Array:
     if not used.all():
         C = C * used[..., None, :]
         S = np.where(used[..., None, :] & used[..., :, None], S, np.eye(S.shape[-1]))
-    return _transposed(np.linalg.solve(S, _transposed(C)))
+    solved = np.linalg.solve(S, _transposed(C)).astype(float, copy=False)
+    return _transposed(solved)
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ def _scene(origin: str, name: str, size: float) -> rrb.Spatial3DView:
 def _health(layout: Layout) -> rrb.Container:
     """Is the filter right, and does it know: errors, innovations, NIS."""
     rows: list[_Item] = []
-    if layout.has_truth:
+    if layout.true_parts:
         for name, part in layout.space.parts.items():
             if name in layout.true_parts:
                 views = [

@@ -22,11 +22,8 @@ _NAMES = ("motion capture", "documented constants", "fitted constants")
 _COLOURS = (schema.TRUTH, (190, 100, 50), schema.ESTIMATE)
 _WIDTHS = (3.5, 2.0, 1.0)
 _PLOTS = (
-    {f"gravity/{angle}": f"{angle.capitalize()} from gravity [deg]" for angle in ("roll", "pitch", "error")},
-    {
-        f"gyro/{angle}": f"{angle.capitalize()} of the integrated gyro [deg]"
-        for angle in ("roll", "pitch", "yaw", "error")
-    },
+    {f"gravity/{a}": f"{a.capitalize()} from gravity [deg]" for a in ("roll", "pitch", "error")},
+    {f"gyro/{a}": f"{a.capitalize()} of the integrated gyro [deg]" for a in ("roll", "pitch", "yaw", "error")},
 )
 _WHAT_TO_LOOK_AT = """## What to look at
 - **From gravity**: the accelerometer alone shakes with every push of the hand. A line that stays on one side of motion

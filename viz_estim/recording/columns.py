@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -27,6 +28,7 @@ class Times:
     def pick(self, rows: np.ndarray) -> Times:
         return Times(self.step[rows], self.time[rows], self.stage[rows])
 
+    @cached_property
     def columns(self) -> list[rr.TimeColumn]:
         """All three, for a row that holds data."""
         nanoseconds = np.round(self.time * 1e9).astype("timedelta64[ns]")
@@ -37,35 +39,57 @@ class Times:
         ]
 
 
-class _Values:
-    """A flat float64 array as Rerun wants to see a component's batch."""
+class _Batch:
+    """An arrow array as Rerun wants to see a component's batch."""
 
-    def __init__(self, values: Array) -> None:
+    def __init__(self, values: pa.Array) -> None:
         self.values = values
 
     def as_arrow_array(self) -> pa.Array:
-        return pa.array(self.values)
+        return self.values
+
+
+def _offsets(counts: int | np.ndarray, rows: int) -> np.ndarray:
+    if isinstance(counts, int):
+        return np.arange(rows + 1, dtype=np.int32) * np.int32(counts)
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
 
 
 @cache
-def _descriptor(archetype: str, component: str) -> rr.ComponentDescriptor:
+def _named(archetype: str, component: str) -> rr.ComponentDescriptor:
     return rr.ComponentDescriptor(component).with_builtin_archetype(archetype)
 
 
-def numbers(archetype: str, component: str, rows: Sequence[Array | None]) -> rr.ComponentColumn:
+def numbers(archetype: str, component: str, rows: Array | Sequence[Array | None]) -> rr.ComponentColumn:
     """Float64 arrays as one column, bit for bit, row-major; rows may be None or of several lengths."""
-    descriptor = _descriptor(archetype, component)
-    sizes = {-1 if row is None else row.size for row in rows}
-    if len(sizes) == 1 and -1 not in sizes:
-        flat = np.array(rows, dtype=float).ravel()
-        offsets = np.arange(len(rows) + 1, dtype=np.int32) * np.int32(sizes.pop())
-        return rr.ComponentColumn(descriptor, _Values(flat), offsets=offsets)
-    lengths = [0 if row is None else row.size for row in rows]
-    present = [np.asarray(row, float).ravel() for row in rows if row is not None]
-    flat = np.concatenate(present) if present else np.empty(0)
-    return rr.ComponentColumn(descriptor, _Values(flat), lengths=lengths)
+    if isinstance(rows, np.ndarray):
+        flat, counts = np.asarray(rows, float).ravel(), _offsets(rows.size // max(1, len(rows)), len(rows))
+    else:
+        present = [np.asarray(row, float).ravel() for row in rows if row is not None]
+        flat = np.concatenate(present) if present else np.empty(0)
+        counts = _offsets(np.array([0 if row is None else np.size(row) for row in rows]), len(rows))
+    return rr.ComponentColumn(_named(archetype, component), _Batch(pa.array(flat)), offsets=counts)
 
 
-def partition(columns: rr.ComponentColumnList, count: int, rows: int) -> Iterable[rr.ComponentColumn]:
-    """Columns of `rows` batches, each of `count` instances."""
-    return columns.partition(np.full(rows, count))
+@cache
+def _kind(archetype: Any, component: str) -> tuple[rr.ComponentDescriptor, pa.DataType]:
+    """A component's descriptor and arrow type, learnt from a column that Rerun makes of one value."""
+    one = [1.0] if component in ("values", "variances") else [[1.0] * (4 if component == "quaternions" else 3)]
+    (column,) = archetype.columns(**{component: one})
+    return column.descriptor, column.component_batch.as_arrow_array().type
+
+
+def drawn(archetype: Any, counts: int | np.ndarray, rows: int, **components: Array) -> list[rr.ComponentColumn]:
+    """Components of an archetype, `counts` instances a row: what `archetype.columns(…).partition(…)` gives, without
+    its checks of each value, which take longer than all else."""
+    offsets = _offsets(counts, rows)
+    columns = []
+    for name, values in components.items():
+        descriptor, kind = _kind(archetype, name)
+        if pa.types.is_fixed_size_list(kind):
+            flat = pa.array(np.asarray(values, np.float32).ravel())
+            batch = pa.FixedSizeListArray.from_arrays(flat, type=kind)
+        else:
+            batch = pa.array(np.asarray(values, float).ravel())
+        columns.append(rr.ComponentColumn(descriptor, _Batch(batch), offsets=offsets))
+    return columns

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from viz_estim.core.run import Step
-from viz_estim.core.spaces import Product, Space, describe, rebuild
-from viz_estim.core.stages import Innovation, SigmaPoints
+from viz_estim.core.spaces import Product, Space, describe
+from viz_estim.core.stages import Innovation, SigmaPoints, Stage
+from viz_estim.recording.batch import Batch
 
 
 class Layout:
@@ -29,57 +29,46 @@ class Layout:
         self.sensors: dict[str, Space] = {}
         self.true_parts: list[str] = []
         self.reach: dict[str, float] = {}
-        self._seen: set[tuple[str, ...]] = set()
 
-    def learn(self, steps: list[Step]) -> bool:
+    def learn(self, batch: Batch) -> bool:
         """Takes in what is new; True where anything is."""
         before = (len(self.stages), len(self.inputs), len(self.true_parts))
-        for step in steps:
-            key = (*(stage.name for stage in step.stages), "|", *step.tick.measurements, *step.tick.raw)
-            if key not in self._seen:
-                self._seen.add(key)
-                self._learn(step)
-        truths = [step.truth for step in steps if step.truth is not None]
-        for name in self.space.parts:
-            if name not in self.true_parts and any(np.isfinite(x[self.space.at[name]]).all() for x in truths):
-                self.true_parts.append(name)
+        for rows in batch.stages:
+            if rows.name not in self.stages:
+                self._learn(rows.stages[0])
+        for step in batch.steps:
+            tick = step.tick
+            for sensor in tick.measurements:
+                if sensor not in self.inputs:
+                    self.inputs.append(sensor)
+            for sensor in tick.raw:
+                if sensor not in self.inputs:
+                    self.inputs.append(sensor)
+        missing = [name for name in self.space.parts if name not in self.true_parts]
+        if missing and any(step.truth is not None for step in batch.steps):
+            known = np.isfinite(batch.truth(len(self.space.names)))
+            self.true_parts += [name for name in missing if known[:, self.space.at[name]].all(1).any()]
         return before != (len(self.stages), len(self.inputs), len(self.true_parts))
 
-    @property
-    def has_truth(self) -> bool:
-        return bool(self.true_parts)
-
-    def _learn(self, step: Step) -> None:
-        self.inputs += [s for s in {**step.tick.measurements, **step.tick.raw} if s not in self.inputs]
-        for stage in step.stages:
-            if stage.name in self.stages:
-                continue
-            fields: dict[str, Any] = {}
-            for field in dataclasses.fields(stage)[2:]:
-                value = getattr(stage, field.name)
-                if isinstance(value, SigmaPoints):
-                    fields[field.name] = {"points": describe(value.space), "count": int(value.points.shape[-2])}
-                elif isinstance(value, Innovation):
-                    fields[field.name] = {"innovation": describe(value.space)}
-                    self.sensors |= value.space.parts
-                    for name, at in value.space.at.items():
-                        self.reach[name] = float(np.linalg.norm(value.z[at])) or 1.0
-                elif isinstance(value, np.ndarray):
-                    fields[field.name] = {"shape": list(value.shape)}
-            self.stages[stage.name] = fields
+    def _learn(self, stage: Stage) -> None:
+        fields: dict[str, Any] = {}
+        for field in dataclasses.fields(stage)[2:]:
+            value = getattr(stage, field.name)
+            if isinstance(value, SigmaPoints):
+                fields[field.name] = {"points": describe(value.space), "count": int(value.points.shape[-2])}
+            elif isinstance(value, Innovation):
+                fields[field.name] = {"innovation": describe(value.space)}
+                self.sensors |= value.space.parts
+                for name, at in value.space.at.items():
+                    size = float(np.linalg.norm(value.z[at]))
+                    self.reach[name] = size if size > 0.1 else 1.0
+            elif isinstance(value, np.ndarray):
+                fields[field.name] = {"shape": list(value.shape)}
+        self.stages[stage.name] = fields
 
     def place(self, sensor: str) -> int:
         """Where the sensor stands among all: its colour."""
         return [*self.inputs, *(name for name in self.sensors if name not in self.inputs)].index(sensor)
-
-    def points(self) -> list[tuple[str, str, Space]]:
-        """Stage, field and space of all sigma points."""
-        return [
-            (stage, field, rebuild(what["points"]))
-            for stage, fields in self.stages.items()
-            for field, what in fields.items()
-            if "points" in what
-        ]
 
     def as_json(self) -> dict[str, Any]:
         return {"stages": self.stages, "inputs": self.inputs}

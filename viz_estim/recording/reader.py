@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
 
 from viz_estim.core.consistency import summary
 from viz_estim.core.quaternions import Array
@@ -153,7 +155,10 @@ def _chunks(path: Path) -> Iterator[Any]:
     try:
         content = ["/__properties/**", "/steps", "/events", "/stages/**"]
         with whole(path) as sound:
-            yield from RrdReader(sound).stream().filter(content=content)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RerunWarning)  # a killed run has no footer: we say so ourselves
+                reader = RrdReader(sound)
+            yield from reader.stream().filter(content=content)
     except (ValueError, OSError, RuntimeError) as error:
         text = " ".join(str(error).split())
         raise BadInput(f"{path}: not a readable recording, or damaged ({text[:120]})") from error
@@ -168,7 +173,7 @@ class _Gathered:
         self._points = points
 
     def add(self, batch: pa.RecordBatch) -> None:
-        if "step" not in batch.schema.names:
+        if not {"step", "time", "stage"} <= set(batch.schema.names):  # not ours
             return
         nanoseconds = batch.column("time").cast(pa.int64()).to_numpy()
         times = {name: batch.column(name).to_numpy() for name in ("step", "stage")}

@@ -15,11 +15,13 @@ import rerun as rr
 
 from viz_estim.core.run import Scenario, Step
 from viz_estim.core.spaces import describe
-from viz_estim.core.stages import Innovation, SigmaPoints, Stage
+from viz_estim.core.stages import Innovation
 from viz_estim.recording import blueprints, schema
+from viz_estim.recording.batch import Batch, StageRows
 from viz_estim.recording.columns import Times, numbers
-from viz_estim.recording.drawing import Drawing
 from viz_estim.recording.layout import Layout
+from viz_estim.recording.plots import Plots
+from viz_estim.recording.scenes import Scenes
 
 _ROWS = 1000
 _BYTES = 8 << 20
@@ -51,7 +53,7 @@ class Recorder:
         self._layout = Layout(scenario.space)
         self._rows: list[Step] = []
         self._limit = 1  # the first step goes out alone: it tells the size of the others, and the view
-        self._stages = 0
+        self._places = 0  # taken on the stage timeline
         self._lock = threading.Lock()
         self._failed: Exception | None = None
         self._closed = threading.Event()
@@ -61,7 +63,8 @@ class Recorder:
         sinks: list[Sink] = [rr.FileSink(self.partial)]
         self._stream.set_sinks(*sinks, *([rr.GrpcSink(live)] if live else []))
         self._stream.send_recording_name(path.stem)
-        self._drawing = Drawing(self._stream, self._layout, scenario)
+        self._scenes = Scenes(self._stream, self._layout, scenario, every)
+        self._plots = Plots(self._stream, self._layout)
         self._properties = dict(properties) | {"space": describe(scenario.space)}
         self._send_properties()
         notes = f"{scenario.notes}\n\n{schema.LEGEND}".strip()
@@ -117,6 +120,7 @@ class Recorder:
             with self._lock:
                 try:
                     self._flush()
+                    self._stream.flush()  # to the file, for a kill may come
                 except Exception as error:  # told at the next step, in the thread that can act on it
                     self._failed = error
                     return
@@ -130,40 +134,31 @@ class Recorder:
         steps, self._rows = self._rows, []
         if not steps:
             return
-        # A step without any stage (it failed at once) still takes a place on the stage timeline.
-        counts = np.array([max(1, len(step.stages)) for step in steps])
-        first = self._stages + np.concatenate([[0], np.cumsum(counts[:-1])])
-        self._stages += int(counts.sum())
-        times = Times(np.array([step.index for step in steps]), np.array([step.tick.time for step in steps]), first)
-        new = self._layout.learn(steps)
-        self._send_steps(steps, times)
-        kept = [(row, place, stage) for row, step in enumerate(steps) for place, stage in enumerate(step.stages)]
-        by_name: dict[str, list[tuple[int, int, Stage]]] = {}
-        for entry in kept:
-            by_name.setdefault(entry[2].name, []).append(entry)
-        for name, entries in by_name.items():
-            rows = np.array([row for row, _, _ in entries])
-            places = np.array([place for _, place, _ in entries])
-            at = Times(times.step[rows], times.time[rows], first[rows] + places)
-            self._send_stage(name, [stage for _, _, stage in entries], at)
-        self._drawing.add(steps, times, counts, self._every)
+        batch = Batch(steps, self._places)
+        self._places = batch.end
+        new = self._layout.learn(batch)
+        self._send_steps(batch)
+        for rows in batch.stages:
+            self._send_stage(rows)
+        self._scenes.add(batch)
+        self._plots.add(batch)
         if new:
             self._send_properties()
             self._stream.send_blueprint(blueprints.build(self._layout))
-        for step in steps:
-            if step.error:
-                text = f"step {step.index}, stage {step.error.stage}: {step.error.message}"
-                row = Times(*(np.array([v]) for v in (step.index, step.tick.time, self._stages - 1)))
-                self._send(schema.EVENTS, row, rr.TextLog.columns(text=[text], level=["ERROR"]))
-        self._stream.flush()
+        if error := steps[-1].error:  # a failure is a run's last step
+            text = f"step {error.step}, stage {error.stage}: {error.message}"
+            last = batch.times.pick(np.array([-1]))
+            at = Times(last.step, last.time, np.array([batch.end - 1]))
+            self._send(schema.EVENTS, at, rr.TextLog.columns(text=[text], level=["ERROR"]))
         if self._limit == 1:
             self._limit = max(1, min(_ROWS, _BYTES // max(1, _size(steps[0]))))
 
     def _send(self, path: str, at: Times, columns: Iterable[rr.ComponentColumn]) -> None:
-        rr.send_columns(path, at.columns(), columns, recording=self._stream, strict=True)
+        rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)
 
-    def _send_steps(self, steps: list[Step], at: Times) -> None:
-        columns = [numbers("viz_estim.Step", "dt", [np.array(step.tick.dt) for step in steps])]
+    def _send_steps(self, batch: Batch) -> None:
+        steps = batch.steps
+        columns = [numbers("viz_estim.Step", "dt", np.array([step.tick.dt for step in steps]))]
         optional = {"truth": [s.truth for s in steps], "control": [s.tick.control for s in steps]}
         for sensor in self._layout.inputs:
             optional[f"z.{sensor}"] = [s.tick.measurements.get(sensor) for s in steps]
@@ -173,29 +168,27 @@ class Recorder:
             for name, rows in optional.items()
             if any(row is not None for row in rows)
         ]
-        self._send(schema.STEPS, at, columns)
+        self._send(schema.STEPS, batch.times, columns)
 
-    def _send_stage(self, name: str, stages: list[Stage], at: Times) -> None:
+    def _send_stage(self, rows: StageRows) -> None:
         kind = "viz_estim.Stage"
-        columns = [
-            numbers(kind, "mean", [s.belief.mean for s in stages]),
-            numbers(kind, "cov", [s.belief.cov for s in stages]),
-        ]
-        drawn = at.step % self._every == 0
-        for field in dataclasses.fields(stages[0])[2:]:
-            values = [getattr(stage, field.name) for stage in stages]
-            if isinstance(values[0], SigmaPoints):
-                rows = [v.points if d else None for v, d in zip(values, drawn, strict=True)]
-                columns.append(numbers(kind, f"{field.name}.points", rows))
-            elif isinstance(values[0], Innovation):
-                columns += [
-                    numbers(kind, f"{field.name}.{part}", [getattr(v, part) for v in values])
-                    for part in Innovation.__slots__
-                    if part != "space"
-                ]
-            elif isinstance(values[0], np.ndarray):
-                columns.append(numbers(kind, field.name, values))
-        self._send(schema.stage(name), at, columns)
+        columns = [numbers(kind, name, rows.values(f"belief.{name}")) for name in ("mean", "cov")]
+        kept = rows.at.step % self._every == 0
+        for field, what in self._layout.stages[rows.name].items():
+            if "points" in what:
+                points = rows.values(f"{field}.points")
+                if not kept.all():
+                    columns.append(
+                        numbers(kind, f"{field}.points", [p if k else None for p, k in zip(points, kept, strict=True)])
+                    )
+                else:
+                    columns.append(numbers(kind, f"{field}.points", points))
+            elif "innovation" in what:
+                parts = [part for part in Innovation.__slots__ if part != "space"]
+                columns += [numbers(kind, f"{field}.{part}", rows.values(f"{field}.{part}")) for part in parts]
+            else:
+                columns.append(numbers(kind, field, rows.values(field)))
+        self._send(schema.stage(rows.name), rows.at, columns)
 
 
 def partial_of(path: Path) -> Path:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import struct
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-# An .rrd stream is a header of 12 bytes and messages of two little-endian uint64, kind and length, and a payload.
-_MAGIC, _HEADER, _MESSAGE = b"RRF2", 12, struct.Struct("<QQ")
+# An .rrd stream is a header of 12 bytes and messages of two little-endian uint64, kind and length, and a payload; where
+# it was ended well, a footer follows, whose last 12 bytes are its mark and the number of its entries.
+_MAGIC, _HEADER, _MESSAGE, _MARK, _MARKED = b"RRF2", 12, struct.Struct("<QQ"), b"RRF2FOOT", 12
 
 
 @contextlib.contextmanager
@@ -33,6 +35,9 @@ def _sound_end(path: Path) -> int:
     size = path.stat().st_size
     with path.open("rb") as file:
         if size < _HEADER or file.read(len(_MAGIC)) != _MAGIC:
+            return size
+        file.seek(-_MARKED, os.SEEK_END)
+        if file.read(len(_MARK)) == _MARK:
             return size
         end = _HEADER
         while end + _MESSAGE.size <= size:

@@ -176,7 +176,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
             raise (refused if self.alive else self._ended()) from error
 
     def _state(self) -> ViewerState:
-        return self._ask(self._client.get_state)  # type: ignore[no-any-return]
+        return self._ask(self._client.get_state)
 
     def _forget(self) -> None:
         self._seen = max((entry.sequence for entry in self._ask(self._client.get_logs)), default=0)

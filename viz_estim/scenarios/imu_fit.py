@@ -135,10 +135,7 @@ def fit(logs: list[ImuLog]) -> Fit:
                 "don't belong together; give the file that does, or shift its stamps"
             )
     (accel_bias, accel_sensitivity), accel_se = _fit_accel(sets, offsets, names)
-    for sensor, value, error in (
-        ("gyro", gyro_sensitivity, gyro_se[1]),
-        ("accelerometer", accel_sensitivity, accel_se[1]),
-    ):
+    for sensor, value, error in (("gyro", gyro_sensitivity, gyro_se[1]), ("accel", accel_sensitivity, accel_se[1])):
         vague = ~(error < _LARGEST_ERROR * value)
         if vague.any():
             raise BadInput(
