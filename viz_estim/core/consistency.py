@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
-from viz_estim.core.spaces import SO3, Product, Space
+from viz_estim.core.spaces import SE2, SO3, Product, Space, wrap
 
 _LEVEL = 0.95
 
@@ -52,15 +52,25 @@ def metrics(space: Space, mean: Array, truth: Array) -> dict[str, float]:
         x, y = mean[:, at[name]], truth[:, at[name]]
         known = np.isfinite(y).all(1) & np.isfinite(x).all(1)
         if known.any():
-            found |= _attitude(x[known], y[known]) if isinstance(part, SO3) else _plain(name, part, x[known], y[known])
+            found |= _errors(name, part, x[known], y[known])
     return found
+
+
+def _errors(name: str, part: Space, x: Array, y: Array) -> dict[str, float]:
+    if isinstance(part, SO3):
+        return _attitude(x, y)
+    if isinstance(part, SE2):
+        turn = wrap(x[:, 2:] - y[:, 2:])
+        return {"position_rmse_m": rms(x[:, :2] - y[:, :2]), "heading_rmse_rad": rms(turn)}
+    unit = _UNIT_NAMES.get(part.axis_units[0], part.axis_units[0])
+    return {f"{name}_rmse_{unit}" if unit else f"{name}_rmse": rms(part.minus(x, y))}
 
 
 def _attitude(x: Array, y: Array) -> dict[str, float]:
     relative = quaternions.multiply(quaternions.conjugate(y), x)
     angle = rms(quaternions.log(relative))
     turns = quaternions.to_euler(x) - quaternions.to_euler(y)
-    roll, pitch, yaw = np.sqrt((((turns + np.pi) % (2 * np.pi) - np.pi) ** 2).mean(0))
+    roll, pitch, yaw = np.sqrt((wrap(turns) ** 2).mean(0))
     up = np.array([0.0, 0.0, 1.0])
     up_x, up_y = (quaternions.rotate(quaternions.conjugate(q), up) for q in (x, y))
     tilt = np.arctan2(np.linalg.norm(np.cross(up_x, up_y), axis=-1), (up_x * up_y).sum(-1))
@@ -69,11 +79,6 @@ def _attitude(x: Array, y: Array) -> dict[str, float]:
 
 
 _UNIT_NAMES = {"m": "m", "rad": "rad", "m/s": "mps", "rad/s": "radps", "m/s²": "mps2"}
-
-
-def _plain(name: str, part: Space, x: Array, y: Array) -> dict[str, float]:
-    unit = _UNIT_NAMES.get(part.axis_units[0], part.axis_units[0])
-    return {f"{name}_rmse_{unit}" if unit else f"{name}_rmse": rms(part.minus(x, y))}
 
 
 @dataclass(frozen=True)

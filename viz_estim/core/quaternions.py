@@ -84,7 +84,7 @@ def to_matrix(q: Array) -> Array:
 
 
 def from_matrix(r: Array) -> Array:
-    """Quaternions (*, 4) with w ≥ 0 of rotation matrices (*, 3, 3); Bar-Itzhack (2000), eq. 4, by eigenvectors.
+    """Quaternions (*, 4) with w ≥ 0 of rotation matrices (*, 3, 3); Bar-Itzhack (2000), by eigenvectors.
 
     The nearest rotation is taken where a matrix is a little off orthonormal.
     """

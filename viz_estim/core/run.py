@@ -115,7 +115,6 @@ def run(scenario: Scenario, seed: int = 0) -> Iterator[Step]:
     """The scenario's steps, one a tick; the last one carries a failure where the estimator raised one."""
     belief: Belief | None = None
     chance = Chance(seed)
-    usual: tuple[str, ...] = ()
     for k, tick in enumerate(scenario.ticks):
         stages: list[Stage] = []
         error = None
@@ -131,19 +130,16 @@ def run(scenario: Scenario, seed: int = 0) -> Iterator[Step]:
                     raise NotFinite("the belief is no longer finite")
         except Exception as failure:  # whatever a person's filter raises is what they came to see
             text = f"{type(failure).__name__}: {failure}"
-            error = Failure(k, _failing_stage(stages, usual, failure), text)
-        usual = tuple(stage.name for stage in stages if not isinstance(stage, Start))
+            error = Failure(k, _failing_stage(stages, failure), text)
         truth = None if scenario.truth is None else scenario.truth[k]
         yield Step(k, tick, tuple(stages), truth, error)
         if error:
             return
 
 
-def _failing_stage(stages: list[Stage], usual: tuple[str, ...], failure: Exception) -> str:
-    """The stage that did not come: the next in the usual order, or the last one where its belief was refused."""
-    done = [stage.name for stage in stages if not isinstance(stage, Start)]
+def _failing_stage(stages: list[Stage], failure: Exception) -> str:
+    """The stage that failed: by the name left on the exception, or the last one where its belief was refused."""
+    last = stages[-1].name if stages else "start"
     if isinstance(failure, NotFinite):
-        return done[-1]
-    if list(usual[: len(done)]) == done and len(usual) > len(done):
-        return usual[len(done)]
-    return f"after {done[-1]}" if done else "first"
+        return last
+    return str(getattr(failure, "stage", f"after {last}" if stages else "first"))

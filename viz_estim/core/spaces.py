@@ -7,8 +7,8 @@ States are flat arrays (*, n), changes (*, d); all leading axes are batch axes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 
@@ -40,12 +40,11 @@ class Space(Protocol):
         """The matrix (*, d, d) that carries changes at x to changes at plus(x, delta), fixed in the world's frame.
 
         A covariance goes along as A·P·Aᵀ. On a group it is Ad(Exp(−δ)). Without it a direction that no sensor sees
-        (heading, for gravity) would turn with every correction, and look seen (Barrau and Bonnabel 2017, section III).
+        (heading, for gravity) would turn with every correction, and look seen (Barrau and Bonnabel 2017).
         """
         ...
 
 
-_SETTLED = 1e-10  # of the mean's iteration
 _NO_MEAN = "the mean of the points does not settle: they are spread too widely to have one"
 _X, _Y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
 
@@ -55,16 +54,24 @@ def _weighted(values: Array, weights: Array) -> Array:
     return (weights[..., None, :] @ values)[..., 0, :]
 
 
-def _iterated_mean(space: Space, points: Array, weights: Array, guess: Array) -> Array:
-    """The point whose error vectors average to zero, by fixed-point iteration (Kraft 2003, section 3.4; Pennec 1998).
+def _iterated_mean(
+    minus: Callable[[Array, Array], Array],
+    plus: Callable[[Array, Array], Array],
+    points: Array,
+    weights: Array,
+    guess: Array,
+) -> Array:
+    """The point whose error vectors average to zero, by fixed-point iteration (Kraft 2003; Pennec 1998).
 
     ArithmeticError where it does not settle: the points are spread over more than a half turn and have no mean.
     """
     mean = guess
+    # No closer than rounding allows, for large coordinates or the scaled rule's large weights.
+    rounding = 64 * np.finfo(float).eps * max(1.0, float(np.abs(points).max())) * float(np.abs(weights).sum(-1).max())
     for _ in range(100):
-        error = _weighted(space.minus(points, mean[..., None, :]), weights)
-        mean = space.plus(mean, error)
-        if np.abs(error).max(initial=0.0) < _SETTLED:
+        error = _weighted(minus(points, mean[..., None, :]), weights)
+        mean = plus(mean, error)
+        if np.abs(error).max(initial=0.0) < max(1e-10, rounding):
             return mean
     raise ArithmeticError(_NO_MEAN)
 
@@ -111,7 +118,7 @@ class SO2:
         return wrap(y - x)
 
     def mean(self, points: Array, weights: Array) -> Array:
-        return _iterated_mean(self, points, weights, points[..., 0, :])
+        return _iterated_mean(self.minus, self.plus, points, weights, points[..., 0, :])
 
     def transport(self, x: Array, delta: Array) -> Array:
         return _identity(delta)
@@ -134,7 +141,9 @@ class SO3:
     def mean(self, points: Array, weights: Array) -> Array:
         # All in one hemisphere, their chord mean is near: one or two iterations are left.
         aligned = points * np.copysign(1.0, points @ points[..., 0, :, None])
-        return _iterated_mean(self, points, weights, quaternions.normalise(_weighted(aligned, weights)))
+        return _iterated_mean(
+            self.minus, self.plus, points, weights, quaternions.normalise(_weighted(aligned, weights))
+        )
 
     def transport(self, x: Array, delta: Array) -> Array:
         return quaternions.to_matrix(quaternions.exp(-delta))
@@ -167,7 +176,7 @@ class SE2:
         return np.stack([a * forward + half * left, a * left - half * forward, turn], axis=-1)
 
     def mean(self, points: Array, weights: Array) -> Array:
-        return _iterated_mean(self, points, weights, points[..., 0, :])
+        return _iterated_mean(self.minus, self.plus, points, weights, points[..., 0, :])
 
     def transport(self, x: Array, delta: Array) -> Array:
         # Ad of a planar pose (p, θ) is [[R, (p_y, −p_x)], [0, 1]]; here of the step's inverse.
@@ -183,7 +192,7 @@ class SE2:
 class S2:
     """A direction: a unit vector (x, y, z); changes are the two angles along a basis of its tangent plane.
 
-    Hertzberg et al. (2013), section 3.2: the sphere as a ⊞-manifold.
+    Hertzberg et al. (2013): the sphere as a ⊞-manifold.
     """
 
     names: tuple[str, ...] = ("x", "y", "z")
@@ -205,13 +214,10 @@ class S2:
         return (self._log(y, x)[..., None, :] @ np.swapaxes(self.basis(x), -1, -2))[..., 0, :]
 
     def mean(self, points: Array, weights: Array) -> Array:
-        mean = quaternions.normalise(_weighted(points, weights))
-        for _ in range(100):
-            error = _weighted(self._log(points, mean[..., None, :]), weights)
-            mean = self._exp(mean, error)
-            if np.abs(error).max(initial=0.0) < _SETTLED:
-                return mean
-        raise ArithmeticError(_NO_MEAN)
+        guess = _weighted(points, weights)
+        if (quaternions.length(guess) < 1e-6).any():
+            raise ArithmeticError(_NO_MEAN)
+        return _iterated_mean(self._log, self._exp, points, weights, quaternions.normalise(guess))
 
     def transport(self, x: Array, delta: Array) -> Array:
         # Along the great circle; the basis at its end sees the carried tangents.
@@ -229,8 +235,11 @@ class S2:
         """The tangent vector (*, 3) at x that leads to y."""
         cosine = np.einsum("...i,...i->...", x, y)[..., None]
         across = y - cosine * x
-        sine = quaternions.length(across) + 1e-200
-        return np.arctan2(sine, cosine) / sine * across
+        sine = quaternions.length(across)
+        # Exactly opposite, every way there is as long: the first tangent's is taken.
+        opposite = (sine < 1e-12) & (cosine < 0)
+        across = np.where(opposite, self.basis(x)[..., 0, :], across) if opposite.any() else across
+        return np.arctan2(sine, cosine) / np.where(opposite, 1.0, sine + 1e-200) * across
 
 
 class Product:
@@ -277,25 +286,3 @@ class Product:
 def wrap(angle: Array) -> Array:
     """The same angles in [−π, π)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-_PLAIN: dict[str, Any] = {kind.__name__: kind for kind in (SO2, SO3, SE2, S2)}
-
-
-def describe(space: Space) -> dict[str, Any]:
-    """The space as JSON-ready data, which `rebuild` turns back."""
-    if isinstance(space, Product):
-        return {"kind": "Product", "parts": {name: describe(part) for name, part in space.parts.items()}}
-    if isinstance(space, Euclidean):
-        return {"kind": "Euclidean", "names": list(space.names), "units": list(space.units)}
-    return {"kind": type(space).__name__}
-
-
-def rebuild(description: dict[str, Any]) -> Space:
-    """The space that `describe` described."""
-    if description["kind"] == "Product":
-        return Product(**{name: rebuild(part) for name, part in description["parts"].items()})
-    if description["kind"] == "Euclidean":
-        return Euclidean(description["names"], description["units"])
-    plain: Space = _PLAIN[description["kind"]]()
-    return plain

@@ -6,7 +6,10 @@ an `Innovation` into plots and NIS, an array into numbers.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,3 +92,26 @@ class UnscentedUpdate(Update):
 
     sigma: SigmaPoints
     mapped: SigmaPoints
+
+
+P = ParamSpec("P")
+S = TypeVar("S", bound=Stage)
+
+
+def names_its_failures(make: Callable[P, S]) -> Callable[P, S]:
+    """Lets a function that makes a stage leave the stage's name on what it raises: `error.stage`.
+
+    The name is the function's keyword argument `name`, or its default.
+    """
+    default = (make.__kwdefaults__ or {}).get("name", make.__name__)
+
+    @functools.wraps(make)
+    def named(*args: P.args, **kwargs: P.kwargs) -> S:
+        try:
+            return make(*args, **kwargs)
+        except Exception as error:
+            noted: Any = error
+            noted.stage = kwargs.get("name", default)
+            raise
+
+    return named

@@ -23,7 +23,14 @@ from viz_estim.core.beliefs import Gaussian
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick
 from viz_estim.core.spaces import Euclidean, Product, Space
-from viz_estim.core.stages import Innovation, SigmaPoints, Stage, UnscentedPredict, UnscentedUpdate
+from viz_estim.core.stages import (
+    Innovation,
+    SigmaPoints,
+    Stage,
+    UnscentedPredict,
+    UnscentedUpdate,
+    names_its_failures,
+)
 
 
 class Rule(NamedTuple):
@@ -36,7 +43,7 @@ class Rule(NamedTuple):
 
 @cache
 def symmetric(d: int) -> Rule:
-    """The 2d points at ±√d·columns, equally weighted, none at the mean (Julier et al. 1995; Kraft 2003, eq. 34)."""
+    """The 2d points at ±√d·columns, equally weighted, none at the mean (Julier et al. 1995; Kraft 2003)."""
     unit = np.sqrt(d) * np.concatenate([np.eye(d), -np.eye(d)])
     weights = np.full(2 * d, 0.5 / d)
     return Rule(unit, weights, weights)
@@ -61,16 +68,17 @@ def draw(space: Space, mean: Array, cov: Array, rule: Rule) -> SigmaPoints:
 
 
 def moments(sigma: SigmaPoints) -> tuple[Array, Array, Array]:
-    """Mean (*, n), covariance (*, d, d) and error vectors (*, N, d) of sigma points (Kraft 2003, eqs. 52–55, 64)."""
+    """Mean (*, n), covariance (*, d, d) and error vectors (*, N, d) of sigma points (Kraft 2003)."""
     mean = sigma.space.mean(sigma.points, sigma.mean_weights)
     errors = sigma.space.minus(sigma.points, mean[..., None, :])
     return mean, _transposed(errors) @ (sigma.cov_weights[:, None] * errors), errors
 
 
+@names_its_failures
 def predict(
     belief: Gaussian, move: Callable[[Array], Array], noise: Array, rule: Rule, *, name: str = "predict"
 ) -> UnscentedPredict:
-    """The belief moved on, process noise Q added before: x' = move(x ⊞ w), w ~ N(0, Q) (Kraft 2003, eqs. 33–40).
+    """The belief moved on, process noise Q added before: x' = move(x ⊞ w), w ~ N(0, Q) (Kraft 2003).
 
     move maps states (*, N, n) to states; noise Q (d, d).
     """
@@ -80,6 +88,7 @@ def predict(
     return UnscentedPredict(name, Gaussian(belief.space, mean, _symmetrised(cov)), drawn, propagated)
 
 
+@names_its_failures
 def predict_augmented(
     belief: Gaussian, move: Callable[[Array, Array], Array], noise: Array, rule: Rule, *, name: str = "predict"
 ) -> UnscentedPredict:
@@ -152,6 +161,7 @@ class Measurement:
         return directions
 
 
+@names_its_failures
 def update(
     belief: Gaussian,
     z: Array,
@@ -163,7 +173,7 @@ def update(
     offered: np.ndarray | None = None,
     name: str = "update",
 ) -> UnscentedUpdate:
-    """The belief after a reading z (*, n): K = C·S⁻¹, mean ⊞ K·ν, P − K·S·Kᵀ (Kraft 2003, eqs. 67–75).
+    """The belief after a reading z (*, n): K = C·S⁻¹, mean ⊞ K·ν, P − K·S·Kᵀ (Kraft 2003).
 
     The covariance is then carried to the tangent space at the new mean, fixed in the world's frame: Kraft's error
     vectors q_i·q̄⁻¹ are in that frame, ours in the body's, and the transport makes both the same filter.

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from viz_estim.core.spaces import Product, Space, describe
+from viz_estim.core.descriptions import describe
+from viz_estim.core.spaces import Product, Space
 from viz_estim.core.stages import Innovation, SigmaPoints, Stage
 from viz_estim.recording.batch import Batch
 

@@ -8,9 +8,10 @@ import numpy as np
 import rerun as rr
 
 from viz_estim.core.consistency import band, nis
+from viz_estim.core.descriptions import describe
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Step
-from viz_estim.core.spaces import SO3, Euclidean, Product, Space, describe
+from viz_estim.core.spaces import SO3, Euclidean, Product, Space
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
 from viz_estim.recording.columns import Times, drawn

@@ -15,8 +15,9 @@ from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
 from viz_estim.core.consistency import summary
+from viz_estim.core.descriptions import rebuild
 from viz_estim.core.quaternions import Array
-from viz_estim.core.spaces import Product, Space, rebuild
+from viz_estim.core.spaces import Product, Space
 from viz_estim.errors import BadInput
 from viz_estim.recording.rescue import whole
 
@@ -84,7 +85,7 @@ class Run:
             return int(rows[0])
         assert time is not None
         row = int(np.searchsorted(self.time, time + 5e-10, side="right")) - 1  # stamps are kept to the nanosecond
-        if row < 0 or time > self.time[-1] + 1.0:
+        if row < 0 or not time <= self.time[-1] + 1.0:
             raise BadInput(f"{self.path}: no step at {time:g} s; it holds {self.time[0]:g} to {self.time[-1]:g} s")
         return row
 

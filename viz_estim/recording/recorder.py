@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
+from viz_estim.core.descriptions import describe
 from viz_estim.core.run import Scenario, Step
-from viz_estim.core.spaces import describe
 from viz_estim.core.stages import Innovation
 from viz_estim.recording import blueprints, schema
 from viz_estim.recording.batch import Batch, StageRows

@@ -40,6 +40,15 @@ class Calibration:
         """Angular rate (*, 3) in rad/s of counts (*, 3)."""
         return (counts - self.gyro_bias) * (MV_PER_COUNT / self.gyro_sensitivity)
 
+    def by_sensor(self) -> dict[str, dict[str, Any]]:
+        """The constants as `load` reads them."""
+        gyro = {"bias_counts": self.gyro_bias, "sensitivity_mv_per_radps": self.gyro_sensitivity}
+        accel = {"bias_counts": self.accel_bias, "sensitivity_mv_per_mps2": self.accel_sensitivity}
+        return {
+            sensor: {name: values.tolist() for name, values in constants.items()}
+            for sensor, constants in (("accel", accel), ("gyro", gyro))
+        }
+
     def with_gyro_bias(self, bias: Array) -> Calibration:
         return replace(self, gyro_bias=bias)
 

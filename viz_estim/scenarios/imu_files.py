@@ -109,7 +109,7 @@ def _role(path: Path, *, strict: bool) -> str | None:
             role = "truth" if "rots" in fields else "imu" if "vals" in fields else "camera" if "cam" in fields else None
         else:
             role = "imu" if "time" in _read_columns(path) else None
-    except (BadInput, OSError):
+    except BadInput:
         if strict:
             raise
         return None
@@ -181,8 +181,6 @@ def _good_truth(stamps: Array, q: Array, path: Path) -> tuple[Array, Array]:
 def _read_mat(path: Path) -> dict[str, Any]:
     try:
         fields: dict[str, Any] = scipy.io.loadmat(path)
-    except OSError:
-        raise
     except Exception as error:  # scipy raises whatever a damaged file makes it trip over
         raise _unreadable(path, error) from error
     return fields
@@ -196,16 +194,32 @@ def _read_columns(path: Path) -> dict[str, Array]:
         else:
             with path.open(encoding="utf-8-sig") as text:
                 names = [name.strip() for name in text.readline().split(",")]
-                table = np.genfromtxt(text, delimiter=",", ndmin=2)
-            if table.shape[1] != len(names):
-                raise BadInput(f"{path}: {len(names)} column names and {table.shape[1]} columns")
-            columns = dict(zip(names, table.T, strict=True))
-    except (BadInput, OSError):
+                rows = [line.split(",") for line in text if line.strip()]
+            columns = {name: np.array(values) for name, values in zip(names, _cells(path, names, rows), strict=True)}
+    except BadInput:
         raise
     except Exception as error:
         raise _unreadable(path, error) from error
-    if any(column.ndim != 1 or len(column) != len(columns["time"]) for column in columns.values() if "time" in columns):
+    if any(
+        column.ndim != 1 or column.shape != columns["time"].shape for column in columns.values() if "time" in columns
+    ):
         raise BadInput(f"{path}: all columns must be one-dimensional and as long as `time`")
+    return columns
+
+
+def _cells(path: Path, names: list[str], rows: list[list[str]]) -> list[list[float]]:
+    """The columns of a table of texts; an empty cell is NaN."""
+    if not rows:
+        raise BadInput(f"{path}: is empty, or holds column names alone")
+    columns: list[list[float]] = [[] for _ in names]
+    for number, row in enumerate(rows, 2):
+        if len(row) != len(names):
+            raise BadInput(f"{path}: line {number} has {len(row)} cells, the first line {len(names)}")
+        for column, name, cell in zip(columns, names, row, strict=True):
+            try:
+                column.append(float(cell) if cell.strip() else np.nan)
+            except ValueError:
+                raise BadInput(f"{path}: line {number}, {name}: {cell.strip()!r} is not a number") from None
     return columns
 
 

@@ -18,6 +18,7 @@ from viz_estim.scenarios.imu_calibration import ACCEL_SIGNS, DOCUMENTED, MV_PER_
 from viz_estim.scenarios.imu_data import ImuData, prepare, resting_gyro, truth_at
 from viz_estim.scenarios.imu_files import ImuLog
 from viz_estim.scenarios.imu_health import GRAVITY
+from viz_estim.scenarios.imu_series import Series, series
 
 _WINDOW = 0.25  # s: over a shorter one the reference's noise is large beside the rotation
 _FEWEST_WINDOWS = 20  # in a set: 5 s
@@ -75,7 +76,7 @@ class Fit:
 
     def to_json(self) -> dict[str, Any]:
         """What `imu_calibration.load` reads, how sure it is, and what it was made from."""
-        documented, values, errors = (_by_sensor(c) for c in (DOCUMENTED, self.calibration, self.standard_errors))
+        documented, values, errors = (c.by_sensor() for c in (DOCUMENTED, self.calibration, self.standard_errors))
         for sensor in values:
             values[sensor] |= {f"{name.split('_')[0]}_se": error for name, error in errors[sensor].items()}
         return {
@@ -98,23 +99,6 @@ class Fit:
         return pairs
 
 
-@dataclass(frozen=True)
-class Series:
-    """A set under some constants: (T, …) arrays, angles in degrees, NaN where there is none.
-
-    time s from the first stamp. accel_deg (T, 2): roll, pitch of the accelerometer alone. gyro_deg, truth_deg (T, 3):
-    roll, pitch, yaw. accel_error_deg (T,): the angle between gravity as read and as the truth has it; gyro_error_deg
-    (T,): the geodesic angle from the truth to the integrated gyro.
-    """
-
-    time: Array
-    accel_deg: Array
-    gyro_deg: Array
-    truth_deg: Array
-    accel_error_deg: Array
-    gyro_error_deg: Array
-
-
 def fit(logs: list[ImuLog]) -> Fit:
     """Biases and sensitivities of all six channels, and each set's clock offset, by robust least squares.
 
@@ -127,6 +111,10 @@ def fit(logs: list[ImuLog]) -> Fit:
     if not logs:
         raise BadInput("a calibration needs at least one set: an IMU file and its motion capture")
     sets, names = [_Set.of(log) for log in logs], ", ".join(map(_name, logs))
+    seen = np.concatenate([one.gravity(0.0) for one in sets])
+    flat = np.ptp(np.nanpercentile(seen, [5, 95], axis=0), axis=0) < _LEAST_SWING * GRAVITY
+    if flat.any():
+        raise BadInput(f"{names}: gravity hardly varies along {_axes(flat)}; add a set that tilts more")
     (gyro_bias, gyro_sensitivity, offsets), gyro_se = _fit_gyro(sets, names)
     for log, offset in zip(logs, offsets, strict=True):
         if abs(offset) > _LARGEST_OFFSET:
@@ -134,7 +122,7 @@ def fit(logs: list[ImuLog]) -> Fit:
                 f"{_name(log)}: its clock and its motion capture's differ by more than {_LARGEST_OFFSET} s, or the two "
                 "don't belong together; give the file that does, or shift its stamps"
             )
-    (accel_bias, accel_sensitivity), accel_se = _fit_accel(sets, offsets, names)
+    (accel_bias, accel_sensitivity), accel_se = _fit_accel(sets, offsets)
     for sensor, value, error in (("gyro", gyro_sensitivity, gyro_se[1]), ("accel", accel_sensitivity, accel_se[1])):
         vague = ~(error < _LARGEST_ERROR * value)
         if vague.any():
@@ -155,35 +143,6 @@ def fit(logs: list[ImuLog]) -> Fit:
         counts = (len(log.stamps), frozen, unseen, len(one.begin))
         shares.append(SetFit(log, float(offset), float(error), *counts, still))
     return Fit(after, Calibration(accel_se[0], accel_se[1], gyro_se[1], gyro_se[0]), residuals, tuple(shares))
-
-
-def series(log: ImuLog, calibration: Calibration, offset: float = 0.0) -> Series:
-    """The set under these constants, the gyro integrated from the first truth on, through freezes and all.
-
-    offset: how late (s) the truth's stamps are.
-    """
-    truth = truth_at(log.stamps, log, offset)
-    if not np.isfinite(truth).any():
-        raise BadInput(f"{_name(log)}: no motion capture at the IMU's stamps, nothing to compare with")
-    first = int(np.argmax(np.isfinite(truth).all(1)))
-    rate, force = calibration.gyro(log.gyro), calibration.accel(log.accel)
-    attitude = quaternions.exp(rate * np.diff(log.stamps, prepend=log.stamps[0])[:, None])
-    attitude[:first], attitude[first] = np.nan, truth[first]
-    stride = 1
-    while stride < len(truth) - first:  # products of 2, 4, 8, … turns up to each sample (Hillis & Steele 1986)
-        attitude[first + stride :] = multiply(attitude[first:-stride], attitude[first + stride :])
-        stride *= 2
-    x, y, z = force.T
-    up = quaternions.rotate(conjugate(truth), _UP)
-    cosine = (up * force).sum(1) / np.maximum(np.linalg.norm(force, axis=1), 1e-9)
-    return Series(
-        log.stamps - log.stamps[0],
-        np.degrees(np.stack([np.arctan2(y, z), np.arctan2(-x, np.hypot(y, z))], axis=1)),
-        np.degrees(quaternions.to_euler(attitude)),
-        np.degrees(quaternions.to_euler(truth)),
-        np.degrees(np.arccos(np.clip(cosine, -1, 1))),
-        np.degrees(quaternions.length(quaternions.log(multiply(conjugate(truth), attitude)))[:, 0]),
-    )
 
 
 @dataclass(frozen=True)
@@ -276,13 +235,10 @@ def _fit_gyro(sets: list[_Set], names: str) -> tuple[list[Array], list[Array]]:
     return np.split(x, [3, 6]), np.split(errors, [3, 6])
 
 
-def _fit_accel(sets: list[_Set], offsets: Array, names: str) -> tuple[Array, Array]:
+def _fit_accel(sets: list[_Set], offsets: Array) -> tuple[Array, Array]:
     """Biases and sensitivities (2, 3), and their errors: counts = bias + sign·gravity·sensitivity·1023/3300."""
     gravity = np.concatenate([one.gravity(offset) for one, offset in zip(sets, offsets, strict=True)])
     known = np.isfinite(gravity[:, 0])
-    flat = np.ptp(np.percentile(gravity[known], [5, 95], axis=0), axis=0) < _LEAST_SWING * GRAVITY
-    if flat.any():
-        raise BadInput(f"{names}: gravity hardly varies along {_axes(flat)}; add a set that tilts more")
     counts = np.concatenate([one.data.log.accel for one in sets])[known]
     blocks = _blocks([one.data.time for one in sets])[known]
     pushes, starts = (
@@ -315,7 +271,7 @@ def _solve(
     H = J.T @ (J * z[:, None] ** -1.5)  # soft-L1 has ρ' = z^(-1/2) and ρ' + 2ρ''r²/scale² = z^(-3/2)
     gradients = np.zeros((blocks.max() + 1, len(x)))
     np.add.at(gradients, blocks, J * (r * z**-0.5)[:, None])
-    half = np.linalg.solve(H, gradients.T)
+    half = np.linalg.lstsq(H, gradients.T)[0]
     count = len(np.unique(blocks))
     return x, np.sqrt((half**2).sum(1) * count / (count - 1))
 
@@ -325,14 +281,6 @@ def _blocks(stamps: list[Array]) -> np.ndarray:
     sizes = [int(t[-1] / _BLOCK) + 1 for t in stamps]
     firsts = np.cumsum([0, *sizes[:-1]])
     return np.concatenate([first + (t / _BLOCK).astype(int) for first, t in zip(firsts, stamps, strict=True)])
-
-
-def _by_sensor(c: Calibration) -> dict[str, dict[str, Any]]:
-    """The constants as `imu_calibration.load` reads them."""
-    return {
-        "accel": {"bias_counts": c.accel_bias.tolist(), "sensitivity_mv_per_mps2": c.accel_sensitivity.tolist()},
-        "gyro": {"bias_counts": c.gyro_bias.tolist(), "sensitivity_mv_per_radps": c.gyro_sensitivity.tolist()},
-    }
 
 
 def _summary(errors: list[Array]) -> dict[str, list[float]]:

@@ -15,6 +15,7 @@ _STEADY = (0.1, 0.5)  # rad/s, m/s²: more scatter than this within the baseline
 _LEVEL = (0.25, 1.0)  # rad/s, m/s²: how far from 0 and from gravity a still sensor may read; beyond, it turns steadily
 _SHORTEST_FREEZE = 0.3  # s
 _UNEXPLAINED = (0.1, 0.5)  # rad: gravity's turn that the gyro must have missed; off its rest level, and on it
+_BIAS_LEFT = 0.005  # rad/s: what may be left of the gyro's bias, and adds up to a turn
 
 GRAVITY = 9.81  # m/s²
 
@@ -63,7 +64,8 @@ def frozen_gyro(stamps: Array, gyro: Array, accel: Array, bias: Array) -> np.nda
     for first, end in edges.reshape(-1, 2):
         rate = gyro[first:end].mean(0) - bias
         off_rest = bool((np.abs(rate) > 3 * quantum).any())
-        if _missed_turn(stamps[first:end], rate, accel[first:end]) > _UNEXPLAINED[0 if off_rest else 1]:
+        explained = _UNEXPLAINED[0 if off_rest else 1] + _BIAS_LEFT * (stamps[end - 1] - stamps[first])
+        if _missed_turn(stamps[first:end], rate, accel[first:end]) > explained:
             frozen[first:end] = True
     return frozen
 
@@ -76,9 +78,21 @@ def _quantum(channel: Array) -> float:
 
 
 def _missed_turn(stamps: Array, rate: Array, accel: Array) -> float:
-    """The largest angle (rad) between gravity as the accelerometer saw it and as a constant rate would carry it."""
-    width = max(3, len(stamps) // 10)
-    seen = uniform_filter1d(accel, width, axis=0, mode="nearest")
+    """By how much (rad) gravity turned otherwise than a constant rate would carry it, at most, and did turn.
+
+    The accelerometer is smoothed over 0.1 s, by whole windows only: those at the ends would lean to one side.
+    """
+    width = max(3, round(_SMOOTHING / float(np.median(np.diff(stamps)))) | 1)
+    half = width // 2
+    if len(stamps) <= 3 * width:
+        return 0.0
+    seen = uniform_filter1d(accel, width, axis=0)[half:-half]
     seen = seen / np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-9)
-    carried = quaternions.rotate(quaternions.exp(-(stamps - stamps[0])[:, None] * rate), seen[:1])
-    return float(np.arccos(np.clip((seen * carried).sum(1), -1, 1)).max())
+    since = stamps[half:-half] - stamps[half]
+    carried = quaternions.rotate(quaternions.exp(-since[:, None] * rate), seen[:1])
+    return min(_widest(seen, carried), _widest(seen, seen[:1]))
+
+
+def _widest(a: Array, b: Array) -> float:
+    """The largest angle (rad) between unit vectors (N, 3)."""
+    return float(np.arccos(np.clip((a * b).sum(1), -1, 1)).max())

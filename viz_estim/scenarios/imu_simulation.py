@@ -16,6 +16,7 @@ from viz_estim.scenarios.imu_files import ImuLog
 from viz_estim.scenarios.imu_health import GRAVITY
 
 _FINE = 1e-3  # s: the grid on which the motion is integrated
+_GENTLE = 0.3  # of the full motion, at first
 _STUCK = np.array([382, 383, 384])  # counts at which the real sensor freezes
 
 
@@ -41,7 +42,8 @@ def simulate(
     gyro = _counts(gyro + noise_scale * 0.5 * rng.standard_normal(gyro.shape))
     accel = _counts(accel + noise_scale * 0.4 * rng.standard_normal(accel.shape))
     if freeze > 0:
-        begin = rng.uniform(still + 2.0, max(still + 2.1, duration - freeze - 4.0))
+        # As in the real sets: soon after it was picked up, while it is turned gently.
+        begin = min(still + rng.uniform(0.8, 1.6), duration - freeze)
         stuck = (stamps >= begin) & (stamps < begin + freeze)
         gyro[stuck] = _STUCK + rng.integers(-1, 2, (int(stuck.sum()), 3))
 
@@ -72,9 +74,16 @@ def _waves(grid: Array, rng: np.random.Generator, size: float, low_hz: float, hi
 
 
 def _moving(grid: Array, still: float, duration: float) -> Array:
-    """0 while the sensor lies still, 1 while it is handled, smooth between (N, 1); it is put down a second early."""
-    rise = np.clip((grid - still) / 0.5, 0, 1) * np.clip((duration - 1.0 - grid) / 0.5, 0, 1)
-    return (rise * rise * (3 - 2 * rise))[:, None]
+    """0 while the sensor lies still, gentle for 4 s, then 1, smooth between (N, 1); it is put down a second early."""
+    envelope = (
+        _GENTLE * _smooth((grid - still) / 0.5) + (1 - _GENTLE) * _smooth((grid - still - 4.0) / 1.0)
+    ) * _smooth((duration - 1.0 - grid) / 0.5)
+    return envelope[:, None]
+
+
+def _smooth(x: Array) -> Array:
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3 - 2 * x)
 
 
 def _rates(grid: Array, rng: np.random.Generator, still: float, duration: float) -> Array:
