@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
@@ -16,6 +17,7 @@ from viz_estim.scenarios.imu_health import frozen_gyro, still_prefix
 
 _TRUTH_GAP = 0.1  # s: across a longer gap the truth is not interpolated
 
+_FRAMES = 21  # over so many the reference's stamps are evened
 _HANDS_ON = 2.0  # s before the motion is seen; of a short prefix, its second half
 
 
@@ -90,6 +92,18 @@ def truth_at(stamps: Array, log: ImuLog, offset: float = 0.0) -> Array:
     known = near & (times >= log.truth_stamps[0]) & (times <= log.truth_stamps[-1])
     out[known] = quaternions.slerp(times[known], log.truth_stamps, log.truth)
     return out
+
+
+def evened(stamps: Array) -> Array:
+    """Motion capture takes its frames evenly and stamps them when they arrive, up to 10 ms early or late: a frame's
+    stamp is the mean of those around it, unless frames are missing among them."""
+    half = _FRAMES // 2
+    out = stamps.copy()
+    if len(stamps) > _FRAMES:
+        inner, frame = slice(half, -half), float(np.median(np.diff(stamps)))
+        whole = np.abs(stamps[2 * half :] - stamps[: -2 * half] - 2 * half * frame) < 3 * frame
+        out[inner] = np.where(whole, uniform_filter1d(stamps, _FRAMES)[inner], stamps[inner])
+    return np.maximum.accumulate(out)
 
 
 def intervals(flags: np.ndarray) -> list[tuple[int, int]]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 from scipy.optimize import least_squares
 
 from viz_estim.core import quaternions
@@ -15,7 +14,7 @@ from viz_estim.core.quaternions import Array, conjugate, multiply
 from viz_estim.errors import BadInput
 from viz_estim.files import sha256
 from viz_estim.scenarios.imu_calibration import ACCEL_SIGNS, DOCUMENTED, MV_PER_COUNT, Calibration
-from viz_estim.scenarios.imu_data import ImuData, prepare, resting_gyro, truth_at
+from viz_estim.scenarios.imu_data import ImuData, evened, prepare, resting_gyro, truth_at
 from viz_estim.scenarios.imu_files import ImuLog
 from viz_estim.scenarios.imu_health import GRAVITY
 from viz_estim.scenarios.imu_series import Series, series
@@ -28,8 +27,6 @@ _BLOCK = 1.0  # s: residuals in different blocks are taken as independent
 _LEAST_RATE = 0.03  # rad/s rms about an axis, over all sets: below, there is nothing but the reference's noise
 _LEAST_SWING = 0.05  # of gravity, from the 5th to the 95th percentile of what a channel sees over all sets
 _LARGEST_ERROR = 0.05  # of a sensitivity: with less certainty it is not worth having
-_FRAMES = 21  # over so many the reference's stamps are evened
-_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -77,8 +74,8 @@ class Fit:
     def to_json(self) -> dict[str, Any]:
         """What `imu_calibration.load` reads, how sure it is, and what it was made from."""
         documented, values, errors = (c.by_sensor() for c in (DOCUMENTED, self.calibration, self.standard_errors))
-        for sensor in values:
-            values[sensor] |= {f"{name.split('_')[0]}_se": error for name, error in errors[sensor].items()}
+        for sensor, found in values.items():
+            found |= {f"{name.split('_')[0]}_se": error for name, error in errors[sensor].items()}
         return {
             "system": "imu",
             "model": "value = sign * (counts - bias) * 3300 / 1023 / sensitivity; body x forward, y left, z up",
@@ -108,9 +105,9 @@ def fit(logs: list[ImuLog]) -> Fit:
     the reference has it; the hand's own accelerations average out. Standard errors: `_solve`.
     Raises BadInput where a set is not in counts or has no motion capture, or all move too little to tell the constants.
     """
-    if not logs:
-        raise BadInput("a calibration needs at least one set: an IMU file and its motion capture")
     sets, names = [_Set.of(log) for log in logs], ", ".join(map(_name, logs))
+    if not sets:
+        raise BadInput("a calibration needs at least one set: an IMU file and its motion capture")
     seen = np.concatenate([one.gravity(0.0) for one in sets])
     flat = np.ptp(np.nanpercentile(seen, [5, 95], axis=0), axis=0) < _LEAST_SWING * GRAVITY
     if flat.any():
@@ -168,7 +165,7 @@ class _Set:
             raise BadInput(f"{_name(log)}: no motion capture; give its viconRot*.mat too, or put it beside")
         data = prepare(log, None)
         bias = resting_gyro(log, data.still) if data.still else DOCUMENTED.gyro_bias
-        near = replace(log, stamps=data.time, truth_stamps=_evened(log.truth_stamps - log.stamps[0]))
+        near = replace(log, stamps=data.time, truth_stamps=evened(log.truth_stamps - log.stamps[0]))
         # The offset is not known yet: the truth must be there over all that it may be.
         shifts = (-_LARGEST_OFFSET, 0.0, _LARGEST_OFFSET)
         good = ~data.frozen & np.all([np.isfinite(truth_at(data.time, near, s)).all(1) for s in shifts], axis=0)
@@ -197,19 +194,7 @@ class _Set:
 
     def gravity(self, offset: float) -> Array:
         """What the accelerometer would read at rest, by the truth (T, 3), m/s²; NaN where there is none."""
-        return quaternions.rotate(conjugate(truth_at(self.log.stamps, self.log, offset)), GRAVITY * _UP)
-
-
-def _evened(stamps: Array) -> Array:
-    """Motion capture takes its frames evenly and stamps them when they arrive, up to 10 ms early or late: a frame's
-    stamp is the mean of those around it, unless frames are missing among them."""
-    half = _FRAMES // 2
-    out = stamps.copy()
-    if len(stamps) > _FRAMES:
-        inner, frame = slice(half, -half), float(np.median(np.diff(stamps)))
-        whole = np.abs(stamps[2 * half :] - stamps[: -2 * half] - 2 * half * frame) < 3 * frame
-        out[inner] = np.where(whole, uniform_filter1d(stamps, _FRAMES)[inner], stamps[inner])
-    return np.maximum.accumulate(out)
+        return quaternions.rotate(conjugate(truth_at(self.log.stamps, self.log, offset)), np.array([0.0, 0.0, GRAVITY]))
 
 
 def _fit_gyro(sets: list[_Set], names: str) -> tuple[list[Array], list[Array]]:
@@ -232,6 +217,10 @@ def _fit_gyro(sets: list[_Set], names: str) -> tuple[list[Array], list[Array]]:
 
     start = np.concatenate([DOCUMENTED.gyro_bias, DOCUMENTED.gyro_sensitivity, np.zeros(len(sets))])
     x, errors = _solve(residual, jacobian, start, np.repeat(_blocks([one.begin for one in sets]), 3))
+    if np.abs(residual(x)).mean() > 0.5 * np.abs(turned).mean():
+        raise BadInput(
+            f"{names}: the gyro's readings stay unsure: they don't explain how the body turned; other files?"
+        )
     return np.split(x, [3, 6]), np.split(errors, [3, 6])
 
 

@@ -40,9 +40,8 @@ def series(log: ImuLog, calibration: Calibration, offset: float = 0.0) -> Series
     """
     truth = truth_at(log.stamps, log, offset)
     if not np.isfinite(truth).any():
-        raise BadInput(
-            f"{log.files[0] if log.files else 'the set'}: no motion capture at the IMU's stamps, nothing to compare with"
-        )
+        name = log.files[0] if log.files else "the set"
+        raise BadInput(f"{name}: no motion capture at the IMU's stamps, nothing to compare with")
     first = int(np.argmax(np.isfinite(truth).all(1)))
     rate, force = calibration.gyro(log.gyro), calibration.accel(log.accel)
     attitude = quaternions.exp(rate * np.diff(log.stamps, prepend=log.stamps[0])[:, None])

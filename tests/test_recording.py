@@ -1,0 +1,242 @@
+"""What an estimator did comes back from its recording, bit for bit; what is drawn stands as long as its stage does."""
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from conftest import SHORT
+from rerun.chunk import RrdReader
+
+import viz_estim
+from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.quaternions import Array
+from viz_estim.core.run import Scenario, Step, Tick, run
+from viz_estim.core.spaces import SO3, Euclidean, Product
+from viz_estim.core.stages import Innovation, SigmaPoints, Stage
+from viz_estim.core.unscented import Measurement, Sensor, predict, symmetric, update
+from viz_estim.parameters import parameters
+from viz_estim.recording.reader import Run
+from viz_estim.recording.recorder import Recorder
+from viz_estim.running import find, plan
+from viz_estim.scenarios import SCENARIOS
+
+ODD, SHARED = "stages that differ from step to step", "two stages that share a sensor"
+every_scenario = pytest.mark.parametrize("name", [*SCENARIOS, ODD, SHARED])
+Kept = dict[str, tuple[Path, list[Step]]]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Learn(Stage):
+    """A stage that the project knows nothing of."""
+
+    weights: Array
+    table: Array
+    note: str = "not a number"
+
+
+@dataclasses.dataclass(frozen=True)
+class Odd:
+    """Another set of stages at each step: `gps` at every third, `learn` until step 20, nothing at all at step 12.
+
+    again: a step after each `gps` the same sensor is taken in once more, by a stage of another name.
+    """
+
+    again: bool = False
+    gps = Measurement({"gps": Sensor(Euclidean(("x", "y", "z"), "m"), lambda q: 5 * q[..., 1:], np.eye(3))})
+
+    def step(self, belief: Gaussian, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
+        k = round(10 * tick.time)
+        if k == 12:
+            return
+        moved = predict(belief, lambda q: q, 1e-4 * np.eye(3), symmetric(3))
+        yield moved
+        belief = moved.belief
+        if k % 3 == 0 or (self.again and k % 3 == 1):
+            name = "gps_again" if k % 3 else "gps"
+            taken = update(belief, tick.measurements["gps"], self.gps, symmetric(3), name=name)
+            yield taken
+            belief = taken.belief
+        if k < 20:
+            yield Learn("learn", belief, rng.standard_normal(3), rng.standard_normal((2, 4)))
+
+
+def made_up(estimator: Odd) -> Scenario:
+    belief = Gaussian(Product(attitude=SO3()), np.array([1.0, 0, 0, 0]), 0.01 * np.eye(3))
+    gps = np.random.default_rng(0).standard_normal((40, 3))
+    ticks = [Tick(k / 10, 0.1, measurements={"gps": gps[k]} if k % 3 < 2 else {}) for k in range(40)]
+    return Scenario(estimator, {0: belief}, ticks)
+
+
+def scenario(name: str) -> Scenario:
+    """A scenario on short simulated data, whatever its data function can be told."""
+    if name in (ODD, SHARED):
+        return made_up(Odd(again=name == SHARED))
+    source = find(name)
+    known = parameters(source.data) if source.data else {}
+    settings = [s for s in SHORT if s.removeprefix("data.").partition("=")[0] in known]
+    made = plan(name, data=None, calibration=None, settings=settings, seed=3).build()
+    return dataclasses.replace(made, ticks=made.ticks[:400])
+
+
+def record(path: Path, made: Scenario, *, every: int = 1) -> list[Step]:
+    steps = []
+    with Recorder(path, made, {"scenario": "test"}, every=every) as recorder:
+        for step in run(made, 5):
+            recorder.add(step)
+            steps.append(step)
+    return steps
+
+
+@pytest.fixture(scope="session")
+def kept() -> Kept:
+    return {}
+
+
+@pytest.fixture
+def recorded(name: str, kept: Kept, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Step]]:
+    """The recording of a scenario, made once, and the steps that went into it."""
+    if name not in kept:
+        path = tmp_path_factory.mktemp("recorded") / "run.rrd"
+        kept[name] = path, record(path, scenario(name))
+    return kept[name]
+
+
+def same(read: Any, held: Any) -> bool:
+    """Equal to the last bit, NaN and the sign of zero among them."""
+    read, held = np.asarray(read, float), np.asarray(held, float)
+    return read.shape == held.shape and read.tobytes() == held.tobytes()
+
+
+def assert_holds(loaded: Run, steps: list[Step], every: int = 1) -> None:
+    """All numbers of all stages are in the run, and its stages come in the same order."""
+    assert same(loaded.step, [step.index for step in steps])
+    for row, step in enumerate(steps):
+        tables = loaded.at(step.index)
+        assert [table.name for table, _ in tables] == [stage.name for stage in step.stages]
+        for stage, (table, at) in zip(step.stages, tables, strict=True):
+            held: dict[str, Any] = {"mean": stage.belief.mean, "cov": stage.belief.cov}
+            for field in dataclasses.fields(stage)[2:]:
+                value = getattr(stage, field.name)
+                if isinstance(value, SigmaPoints):
+                    missing = np.full(value.points.shape, np.nan)
+                    held[f"{field.name}.points"] = missing if row % every else value.points
+                elif isinstance(value, Innovation):
+                    held |= {f"{field.name}.{p}": getattr(value, p) for p in Innovation.__slots__ if p != "space"}
+                elif isinstance(value, np.ndarray):
+                    held[field.name] = value
+            assert set(held) == set(table.values)
+            assert [key for key, value in held.items() if not same(table.values[key][at], value)] == []
+        if step.stages:
+            assert same(loaded.mean[row], step.stages[-1].belief.mean)
+            assert same(loaded.cov[row], step.stages[-1].belief.cov)
+
+
+@every_scenario
+def test_every_number_comes_back_bit_for_bit(recorded: tuple[Path, list[Step]]) -> None:
+    path, steps = recorded
+    loaded = viz_estim.load(path)
+    assert_holds(loaded, steps)
+    assert loaded.complete
+    assert same(loaded.dt, [step.tick.dt for step in steps])
+    missing = np.full(len(loaded.space.names), np.nan)
+    assert same(loaded.truth, [missing if step.truth is None else step.truth for step in steps])
+    for name, values in loaded.inputs.items():
+        kind, _, sensor = name.partition(".")
+        where = {"z": "measurements", "raw": "raw", "control": "control"}[kind]
+        for step, value in zip(steps, values, strict=True):
+            given = getattr(step.tick, where)
+            given = given if kind == "control" else given.get(sensor)
+            assert same(value, np.full(value.shape, np.nan) if given is None else given)
+    ticks = [step.tick for step in steps]
+    given = {f"z.{s}" for tick in ticks for s in tick.measurements} | {f"raw.{s}" for tick in ticks for s in tick.raw}
+    assert set(loaded.inputs) - {"control"} == given
+
+
+def test_every_thins_sigma_points_and_no_numbers(tmp_path: Path) -> None:
+    made = scenario("imu-ukf")
+    steps = record(tmp_path / "thin.rrd", made, every=5)
+    assert_holds(viz_estim.load(tmp_path / "thin.rrd"), steps, every=5)
+    assert_geometry(tmp_path / "thin.rrd", steps, every=5)
+
+
+def rows_of(path: Path) -> Iterator[tuple[str, dict[str, int], list[int]]]:
+    """Of each row that is not static: its entity, its times by timeline, and the lengths of its components' batches."""
+    for chunk in RrdReader(path).stream():
+        if not chunk.is_static:
+            batch = chunk.to_record_batch()
+            times = {name: batch.column(name).cast(pa.int64()).to_pylist() for name in chunk.timeline_names}
+            columns = [c for n, c in zip(batch.schema.names, batch.columns, strict=True) if ":" in n]
+            lengths = [column.value_lengths().to_pylist() for column in columns]
+            for row in range(batch.num_rows):
+                here = {name: values[row] for name, values in times.items()}
+                yield str(chunk.entity_path), here, [n[row] for n in lengths if n[row] is not None]
+
+
+@every_scenario
+def test_data_rows_carry_three_timelines_and_rows_that_only_clear_may_carry_stage_alone(
+    recorded: tuple[Path, list[Step]],
+) -> None:
+    path, steps = recorded
+    places = []
+    for entity, times, lengths in rows_of(path):
+        assert set(times) in ({"step", "time", "stage"}, {"stage"})
+        if set(times) == {"stage"}:
+            assert not any(lengths), f"{entity} at {times}"
+        else:
+            assert times["time"] == round(steps[times["step"]].tick.time * 1e9)
+        places += [times["stage"]] if entity.startswith("/stages/") else []
+    counts = [max(1, len(step.stages)) for step in steps]  # a step without stages takes a place of its own
+    starts = np.cumsum([0, *counts[:-1]])
+    expected = [start + i for start, step in zip(starts, steps, strict=True) for i in range(len(step.stages))]
+    assert sorted(places) == expected
+
+
+def assert_geometry(path: Path, steps: list[Step], every: int = 1) -> None:
+    """At each moment of each timeline a viewer shows (by an entity's latest row) what that moment's stages drew."""
+    rows: dict[tuple[str, str], dict[int, bool]] = defaultdict(dict)
+    for entity, times, lengths in rows_of(path):
+        if entity.startswith(("/sensors/", "/world/")) and entity.split("/")[2] not in ("estimate", "truth"):
+            for timeline, value in times.items():
+                assert value not in rows[entity, timeline], f"{entity}: rows at {timeline} {value} hide each other"
+                rows[entity, timeline][value] = any(lengths)
+    moments: dict[str, list[tuple[int, set[str]]]] = {"step": [], "time": [], "stage": []}
+    place = 0
+    for step in steps:
+        shown = [owned(stage) if step.index % every == 0 else set() for stage in step.stages] or [set()]
+        moments["step"].append((step.index, set().union(*shown)))
+        moments["time"].append((round(step.tick.time * 1e9), set().union(*shown)))
+        moments["stage"] += [(place + i, paths) for i, paths in enumerate(shown)]
+        place += len(shown)
+    drawn = set().union(*(paths for _, paths in moments["step"]))
+    assert {entity for entity, _ in rows} == drawn
+    for (entity, timeline), found in rows.items():
+        visible = False
+        for value, paths in moments[timeline]:
+            visible = found.get(value, visible)
+            assert visible == (entity in paths), f"{entity} at {timeline} {value}"
+
+
+def owned(stage: Stage) -> set[str]:
+    """The geometry that a stage draws: points of attitudes in the world, points and readings of sensors in theirs."""
+    paths = set()
+    for field in dataclasses.fields(stage)[2:]:
+        value = getattr(stage, field.name)
+        parts = value.space.parts if isinstance(value, SigmaPoints | Innovation) else {}
+        if isinstance(value, Innovation):
+            seen = [sensor for sensor, part in parts.items() if len(part.names) == 3]
+            paths |= {f"/sensors/{sensor}/{arrow}" for sensor in seen for arrow in ("measured", "predicted")}
+        elif any(isinstance(part, SO3) for part in parts.values()):
+            paths.add(f"/world/{stage.name}/{field.name}")
+        else:
+            paths |= {f"/sensors/{sensor}/{field.name}" for sensor, part in parts.items() if len(part.names) == 3}
+    return paths
+
+
+@every_scenario
+def test_geometry_stands_on_each_timeline_while_its_stage_does(recorded: tuple[Path, list[Step]]) -> None:
+    assert_geometry(*recorded)
