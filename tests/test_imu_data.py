@@ -247,3 +247,12 @@ class Unpickled:
 
 def test_nothing_is_unpickled_from_an_npz(tmp_path: Path) -> None:
     refused(write(tmp_path / "bad1.npz", {"time": np.array([Unpickled()], object)}))
+
+
+def test_a_freeze_that_ends_at_rest_is_parted_from_the_rest() -> None:
+    rng, stamps = np.random.default_rng(5), np.arange(0.0, 4.0, 0.01)
+    stuck = (stamps >= 1.0) & (stamps < 2.0)
+    tilt = np.minimum(np.maximum(stamps - 1.0, 0.0), 1.0)[:, None] * [0.8, 0.0, 0.0]  # it turns while it is stuck
+    accel = quaternions.rotate(quaternions.exp(-tilt), np.array([0.0, 0.0, 9.81]))
+    gyro = np.where(stuck[:, None], 0.15, 0.0) + 0.01 * rng.integers(-1, 2, (len(stamps), 3))
+    assert intervals(frozen_gyro(stamps, gyro, accel, np.zeros(3))) == [(100, 199)]

@@ -46,11 +46,14 @@ def walk(*, fate: str = "raises") -> Scenario:
 
 
 @pytest.mark.parametrize(
-    ("fate", "stages", "words"),
-    [("raises", ["predict"], "LinAlgError: "), ("is NaN", ["predict", "correct"], "NotFinite: ")],
+    ("fate", "stages", "where", "words"),
+    [
+        ("raises", ["predict"], "after predict", "LinAlgError: "),
+        ("is NaN", ["predict", "correct"], "correct", "NotFinite: "),
+    ],
 )
 def test_a_failure_is_the_recording_s_last_step(
-    cli: Cli, tmp_path: Path, fate: str, stages: list[str], words: str
+    cli: Cli, tmp_path: Path, fate: str, stages: list[str], where: str, words: str
 ) -> None:
     (tmp_path / "my.py").write_text(FAILING)
     out = tmp_path / "failed.rrd"
@@ -59,11 +62,11 @@ def test_a_failure_is_the_recording_s_last_step(
     result = json.loads(done.out)
     error = result["error"]
     assert result["steps"] == 8
-    assert {k: error[k] for k in ("step", "stage")} == {"step": 7, "stage": "correct"}
+    assert {k: error[k] for k in ("step", "stage")} == {"step": 7, "stage": where}
     assert error["message"].startswith(words)
     run = viz_estim.load(out)
     assert run.complete
-    assert run.error == f"step 7, stage correct: {error['message']}"
+    assert run.error == f"step 7, stage {where}: {error['message']}"
     assert run.properties["result"]["error"] == error
     assert [table.name for table, _ in run.at(7)] == stages
     shown = json.loads(cli("show", out, "--step", 7, "--json").out)

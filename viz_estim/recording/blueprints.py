@@ -36,20 +36,19 @@ def build(layout: Layout) -> rrb.Blueprint:
 def _scenes(layout: Layout) -> list[_Item]:
     scenes: list[_Item] = []
     if any(isinstance(part, SO3) for part in layout.space.parts.values()):
-        scenes.append(_scene(schema.WORLD, "World: estimate amber, truth white, sigma points on the sphere", 1.0))
+        points = any("points" in what for fields in layout.stages.values() for what in fields.values())
+        title = f"World: estimate amber{', truth white' if layout.true_parts else ''}"
+        scenes.append(_scene(schema.WORLD, f"{title}{', sigma points on the sphere' if points else ''}", 1.0))
     sensors = [
         (name, space)
         for name, space in layout.sensors.items()
         if len(space.names) == 3 and isinstance(space, (Euclidean, S2))
     ]
-    views = [
-        _scene(
-            schema.sensor(name),
-            f"{name}, body axes{_unit(space)}: measured {schema.sensor_colour(layout.place(name))[0]}, predicted amber",
-            layout.reach.get(name, 1.0),
-        )
-        for name, space in sensors
-    ]
+    views: list[_Item] = []
+    for name, space in sensors:
+        colour, _ = schema.sensor_colour(layout.place(name))
+        title = f"{name}, body axes{_unit(space, 0, space.units)}: measured {colour}, predicted amber"
+        views.append(_scene(schema.sensor(name), title, layout.reach[name]))
     if views:
         scenes.append(rrb.Tabs(*views, active_tab=0) if len(views) > 1 else views[0])
     return scenes
@@ -69,7 +68,7 @@ def _health(layout: Layout) -> rrb.Container:
         for name, part in layout.space.parts.items():
             if name in layout.true_parts:
                 views = [
-                    _plot("error", f"{name}.{axis}", f"{name} error {axis}{_unit(part, i)}")
+                    _plot("error", f"{name}.{axis}", f"{name} error {axis}{_unit(part, i)} ±3σ")
                     for i, axis in enumerate(part.axes)
                 ]
                 rows.append(rrb.Horizontal(*views))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from viz_estim.core.descriptions import describe
+from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
 from viz_estim.core.stages import Innovation, SigmaPoints, Stage
 from viz_estim.recording.batch import Batch
@@ -23,17 +24,18 @@ class Layout:
     parts of the state that have a truth.
     """
 
-    def __init__(self, space: Space) -> None:
+    def __init__(self, space: Space, truth: Array | None) -> None:
         self.space = as_product(space)
+        known = np.isfinite(np.empty((0, len(self.space.names))) if truth is None else truth)
+        self.true_parts = [name for name, at in self.space.at.items() if known[:, at].all(1).any()]
         self.stages: dict[str, dict[str, Any]] = {}
         self.inputs: list[str] = []
         self.sensors: dict[str, Space] = {}
-        self.true_parts: list[str] = []
         self.reach: dict[str, float] = {}
 
     def learn(self, batch: Batch) -> bool:
         """Takes in what is new; True where anything is."""
-        before = (len(self.stages), len(self.inputs), len(self.true_parts))
+        before = (len(self.stages), len(self.inputs))
         for rows in batch.stages:
             if rows.name not in self.stages:
                 self._learn(rows.stages[0])
@@ -45,11 +47,7 @@ class Layout:
             for sensor in tick.raw:
                 if sensor not in self.inputs:
                     self.inputs.append(sensor)
-        missing = [name for name in self.space.parts if name not in self.true_parts]
-        if missing and any(step.truth is not None for step in batch.steps):
-            known = np.isfinite(batch.truth(len(self.space.names)))
-            self.true_parts += [name for name in missing if known[:, self.space.at[name]].all(1).any()]
-        return before != (len(self.stages), len(self.inputs), len(self.true_parts))
+        return before != (len(self.stages), len(self.inputs))
 
     def _learn(self, stage: Stage) -> None:
         fields: dict[str, Any] = {}

@@ -85,11 +85,12 @@ class Plots:
             true = true * np.copysign(1.0, np.nansum(true * x, axis=1, keepdims=True))
         for i, component in enumerate(part.names):
             unit, scale = _shown(part.units[i])
-            series: list[Series] = [("estimate", schema.ESTIMATE, scale * x[:, i])]
-            if self._layout.true_parts:
-                series.append(("truth", schema.TRUTH, scale * true[:, i]))
+            series: list[Series] = []
             if reading is not None:
                 series.append((reading[0], self._colour(reading[0]), scale * reading[1][:, i]))
+            if name in self._layout.true_parts:
+                series.append(("truth", schema.TRUTH, scale * true[:, i]))
+            series.append(("estimate", schema.ESTIMATE, scale * x[:, i]))
             path = schema.plot("state", f"{name}.{component}")
             self._plot(path, at, unit, series, scale**2 * var[:, i] if own_sigma else None)
 
@@ -128,7 +129,7 @@ class Plots:
         self._plot(path, at, unit, series)
 
     def _plot(self, path: str, at: Times, unit: str, series: list[Series], variance: Array | None = None) -> None:
-        """Lines in one plot; the variance (N,) is the first one's, drawn as a band."""
+        """Lines in one plot, the last on top; the variance (N,) is that one's, drawn as a band."""
         if path not in self._styled:
             self._styled.add(path)
             names, colours, _ = zip(*series, strict=True)
@@ -139,7 +140,7 @@ class Plots:
         components = {"values": np.stack([values for _, _, values in series], axis=1)}
         if variance is not None:
             components["variances"] = np.zeros_like(components["values"])
-            components["variances"][:, 0] = variance
+            components["variances"][:, -1] = variance
         columns = drawn(rr.Measurements, len(series), len(at), **components)
         rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)
 
@@ -150,10 +151,12 @@ class Plots:
             return
         self._states[name] = states[-1]
         path = schema.lane(name)
-        if name != "stage" and path not in self._styled:
-            self._styled.add(path)
-            values, colours = zip(*schema.HEALTH.items(), strict=True)
-            self._stream.log(path, rr.StateConfiguration(values=values, colors=colours), static=True)
+        meanings = schema.HEALTH if name != "stage" else schema.stage_colours(list(self._layout.stages))
+        key = f"{path} {list(meanings)}"
+        if key not in self._styled:
+            self._styled.add(key)
+            style = rr.StateConfiguration(values=list(meanings), colors=list(meanings.values()))
+            self._stream.log(path, style, static=True)
         columns = rr.StateChange.columns(state=[states[i] for i in changed])
         rr.send_columns(path, at.pick(np.array(changed)).columns, columns, recording=self._stream, strict=True)
 

@@ -50,9 +50,10 @@ class Recorder:
     ) -> None:
         self.path, self.partial = path, partial_of(path)
         self._every = every
-        self._layout = Layout(scenario.space)
+        self._layout = Layout(scenario.space, scenario.truth)
         self._rows: list[Step] = []
         self._limit = 1  # the first step goes out alone: it tells the size of the others, and the view
+        self._viewed: list[str] | None = None
         self._places = 0  # taken on the stage timeline
         self._lock = threading.Lock()
         self._failed: Exception | None = None
@@ -89,7 +90,6 @@ class Recorder:
             raise self._failed
         self._properties["result"] = result
         self._send_properties()
-        self._stream.send_blueprint(blueprints.build(self._layout))
         self._disconnect()
         os.replace(self.partial, self.path)
 
@@ -144,6 +144,8 @@ class Recorder:
         self._plots.add(batch)
         if new:
             self._send_properties()
+        if self._viewed != (sensors := list(self._layout.sensors)):  # the view is built from these, and sent but once
+            self._viewed = sensors
             self._stream.send_blueprint(blueprints.build(self._layout))
         if error := steps[-1].error:  # a failure is a run's last step
             text = f"step {error.step}, stage {error.stage}: {error.message}"

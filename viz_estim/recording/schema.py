@@ -42,6 +42,14 @@ WORLD = "/world"
 PLOTS = "/plots"
 
 
+_STAGES: tuple[Colour, ...] = ((60, 75, 95), (85, 85, 130), (60, 105, 125), (110, 85, 120), (95, 105, 95))
+
+
+def stage_colours(names: list[str]) -> dict[str, Colour]:
+    """A quiet colour for each stage, in the order in which they came."""
+    return {name: _STAGES[i % len(_STAGES)] for i, name in enumerate(names)}
+
+
 def sensor_colour(place: int) -> tuple[str, Colour]:
     """The colour's name and value for the sensor that came at that place."""
     return list(SENSORS.items())[place % len(SENSORS)]

@@ -5,7 +5,7 @@ The body's axes are x forward, y left, z up; the world's z is up. A resting, lev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -76,7 +76,7 @@ def imu_gyro(
     space = Product(attitude=SO3())
     cov = initial_attitude_std**2 * np.eye(3)
     beliefs = _beliefs(data, initial, lambda q: Gaussian(space, q, cov))
-    ticks = [_tick(data, k, k in beliefs, control=data.gyro[k]) for k in range(len(data.time))]
+    ticks = [_tick(data, k, k in beliefs, reads=("gyro",), control=data.gyro[k]) for k in range(len(data.time))]
     notes = (
         "The gyro's rates, integrated. Nothing corrects them: watch the **attitude error** leave its band, slowly by "
         "the bias that is left, at once where the gyro freezes."
@@ -224,10 +224,20 @@ def _level_start(data: ImuData) -> Array:
 
 
 def _tick(
-    data: ImuData, k: int, start: bool, *, reject: bool = False, control: Array | None = None, **readings: Array
+    data: ImuData,
+    k: int,
+    start: bool,
+    *,
+    reject: bool = False,
+    reads: Sequence[str] = ("accel", "gyro"),
+    control: Array | None = None,
+    **readings: Array,
 ) -> Tick:
-    """Sample k as a tick; no prediction where a belief is set. reject: a stand-in for the rate of a frozen gyro."""
-    raw = {"accel": data.log.accel[k], "gyro": data.log.gyro[k]}
+    """Sample k as a tick; no prediction where a belief is set. reject: a stand-in for the rate of a frozen gyro.
+
+    reads: the sensors that the filter reads at all.
+    """
+    raw = {name: values[k] for name, values in (("accel", data.log.accel), ("gyro", data.log.gyro)) if name in reads}
     faults = {"gyro": "frozen"} if data.frozen[k] else {}
     stand_ins = {"gyro": _STAND_IN} if data.frozen[k] and reject else {}
     dt = 0.0 if start else float(data.time[k] - data.time[k - 1])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
@@ -61,13 +63,22 @@ def frozen_gyro(stamps: Array, gyro: Array, accel: Array, bias: Array) -> np.nda
     centres[: width // 2] = centres[-(width // 2) :] = False
     flat = maximum_filter1d(centres, width)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]])))
-    for first, end in edges.reshape(-1, 2):
+    # Two flat runs may touch, where a stuck gyro comes to itself at rest: the jump between them parts them.
+    jumps = np.flatnonzero((np.abs(np.diff(gyro, axis=0)) > 2.01 * quantum).any(1)) + 1
+    bounds = [b for e in edges.reshape(-1, 2) for b in _parted(e[0], e[1], jumps)]
+    for first, end in bounds:
         rate = gyro[first:end].mean(0) - bias
         off_rest = bool((np.abs(rate) > 3 * quantum).any())
         explained = _UNEXPLAINED[0 if off_rest else 1] + _BIAS_LEFT * (stamps[end - 1] - stamps[first])
         if _missed_turn(stamps[first:end], rate, accel[first:end]) > explained:
             frozen[first:end] = True
     return frozen
+
+
+def _parted(first: int, end: int, jumps: np.ndarray) -> list[tuple[int, int]]:
+    """The run from first to before end, parted at the jumps within it."""
+    cuts = [int(first), *jumps[(jumps > first) & (jumps < end)].tolist(), int(end)]
+    return list(pairwise(cuts))
 
 
 def _quantum(channel: Array) -> float:

@@ -1,0 +1,87 @@
+"""What several test files share: the command line in process, one short recorded run, the real data where it is."""
+
+import contextlib
+import io
+import json
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from viz_estim.cli import main
+
+# Half a second of work: still, then turning, then the gyro freezes while it turns.
+SHORT = ["data.duration=6", "data.still=1", "data.freeze=1.5"]
+
+
+class Result(NamedTuple):
+    """What a command left: its exit code and its two outputs."""
+
+    code: int
+    out: str
+    err: str
+
+
+Cli = Callable[..., Result]
+
+
+def run_main(*arguments: object) -> Result:
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings(record=True) as told:
+        code = main([str(argument) for argument in arguments])
+    # Outside of tests a warning is two lines on stderr.
+    shown = [f"{w.filename}: {w.message}\n" for w in told if not issubclass(w.category, DeprecationWarning)]
+    return Result(code, out.getvalue(), err.getvalue() + "".join(shown))
+
+
+def strict(done: Result) -> dict[str, Any]:
+    """The one JSON object that a command printed; NaN and infinity are no JSON."""
+
+    def no(text: str) -> None:
+        raise AssertionError(f"{text} is no JSON")
+
+    assert (done.code, done.err) == (0, "")
+    value = json.loads(done.out, parse_constant=no)
+    assert isinstance(value, dict)
+    return value
+
+
+@pytest.fixture(scope="session")
+def cli() -> Cli:
+    """`cli("show", path, "--json")` runs the command line in this process."""
+    return run_main
+
+
+@pytest.fixture(scope="session")
+def short() -> list[str]:
+    """Options of `run` that make its simulated data short."""
+    return [*(f"--set={setting}" for setting in SHORT), "--seed", "3"]
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory, short: list[str]) -> Path:
+    """A short run of imu-ukf, written by the command line."""
+    path = tmp_path_factory.mktemp("recording") / "short.rrd"
+    done = run_main("run", "imu-ukf", *short, "--out", path)
+    assert (done.code, done.err) == (0, "")
+    return path
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of measurements that nobody here made up; it is no part of the project."""
+    folder = Path(__file__).parents[2] / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip("no real data beside the project")
+    return folder
+
+
+@pytest.fixture
+def no_display(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    yield
+    assert "DISPLAY" not in os.environ
