@@ -1,6 +1,7 @@
 """What several test files share: the command line in process, one short recorded run, the real data where it is."""
 
 import contextlib
+import functools
 import io
 import json
 import os
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from viz_estim.cli import main
+from viz_estim.recording.viewer import Viewer, ViewerError
 
 # Half a second of work: still, then turning, then the gyro freezes while it turns.
 SHORT = ["data.duration=6", "data.still=1", "data.freeze=1.5"]
@@ -85,3 +87,19 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         monkeypatch.delenv(name, raising=False)
     yield
     assert "DISPLAY" not in os.environ
+
+
+@functools.cache
+def _why_nothing_draws() -> str | None:
+    try:
+        Viewer.start(headless=True, size=(200, 200)).close()
+    except ViewerError as error:
+        return str(error)
+    return None
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Tests that draw are skipped where no graphics adapter is, but not in CI: there that is a failure."""
+    draws = item.get_closest_marker("draws") is not None
+    if draws and not os.environ.get("CI") and (why := _why_nothing_draws()):
+        pytest.skip(why)

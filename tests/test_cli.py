@@ -158,6 +158,7 @@ def test_simulated_files_calibrate_and_run(cli: Cli, tmp_path: Path) -> None:
     assert twice["steps"] == plain["steps"]
 
 
+@pytest.mark.draws
 def test_snapshot_has_the_asked_size(cli: Cli, recording: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.png"
     assert cli("snapshot", recording, "--time", "2.5", "--size", "1000x700", "-o", out) == (0, f"{out}\n", "")

@@ -13,6 +13,8 @@ from PIL import Image
 import viz_estim
 from viz_estim.recording.viewer import Viewer
 
+pytestmark = pytest.mark.draws
+
 STEP = 300  # while it turns, and the gyro is alive
 COLOURFUL = 40  # pixels that a line or a few points have at least; an empty view has axes and texts, all grey
 

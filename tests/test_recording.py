@@ -229,11 +229,15 @@ def owned(stage: Stage) -> set[str]:
         parts = value.space.parts if isinstance(value, SigmaPoints | Innovation) else {}
         if isinstance(value, Innovation):
             seen = [sensor for sensor, part in parts.items() if len(part.names) == 3]
-            paths |= {f"/sensors/{sensor}/{arrow}" for sensor in seen for arrow in ("measured", "predicted")}
+            paths |= {
+                f"/sensors/{sensor}/{stage.name}/{arrow}" for sensor in seen for arrow in ("measured", "predicted")
+            }
         elif any(isinstance(part, SO3) for part in parts.values()):
             paths.add(f"/world/{stage.name}/{field.name}")
         else:
-            paths |= {f"/sensors/{sensor}/{field.name}" for sensor, part in parts.items() if len(part.names) == 3}
+            paths |= {
+                f"/sensors/{sensor}/{stage.name}/{field.name}" for sensor, part in parts.items() if len(part.names) == 3
+            }
     return paths
 
 

@@ -8,8 +8,8 @@ from scipy.linalg import block_diag, expm, logm
 from scipy.spatial.transform import Rotation, Slerp
 
 from viz_estim.core import quaternions
-from viz_estim.core.quaternions import Array
 from viz_estim.core.descriptions import describe, rebuild
+from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import S2, SE2, SO2, SO3, Euclidean, Product, Space, wrap
 
 Shape = tuple[int, ...]

@@ -149,6 +149,7 @@ def test_a_killed_run_overwrites_nothing(killed: Killed) -> None:
     assert killed.target.read_bytes() == b"precious"
 
 
+@pytest.mark.draws
 def test_every_command_reads_what_a_kill_left(killed: Killed, cli: Cli, tmp_path: Path) -> None:
     shown = cli("show", killed.partial, "--json")
     assert (shown.code, shown.err) == (0, "")

@@ -51,26 +51,36 @@ class Plan:
 
     def build(self) -> Scenario:
         """Reads or simulates the data and puts the estimator over it."""
-        rng = np.random.default_rng(self.seed)
-        if self.source.data is None:
-            takes_rng = next(iter(inspect.signature(self.source.scenario).parameters), None) == "rng"
-            scenario = self.source.scenario(*([rng] if takes_rng else []), **self.params)
-        else:
-            extra = {"calibration": self.calibration} if self.calibration else {}
-            data = self.source.data(self.files, rng, **self.data_params, **extra)
-            log = getattr(data, "log", data)
-            self.made_of.extend(getattr(log, "files", self.files or ()))
-            scenario = self.source.scenario(data, **self.params)
+        try:
+            scenario = self._built(np.random.default_rng(self.seed))
+        except BadInput:
+            raise
+        except Exception as error:
+            if self.source.system:
+                raise
+            where = f"{type(error).__name__}: {error}"
+            raise BadInput(f"{self.source.name}: raised {where}; mend the function, or give what it needs") from error
         if not isinstance(scenario, Scenario):
             raise BadInput(f"{self.source.name}: returned {type(scenario).__name__}, expected a viz_estim Scenario")
         if not len(scenario.ticks) or 0 not in scenario.beliefs:
             raise BadInput(f"{self.source.name}: a scenario needs at least one tick, and a belief at step 0")
         return scenario
 
+    def _built(self, rng: np.random.Generator) -> Scenario:
+        if self.source.data is None:
+            takes_rng = next(iter(inspect.signature(self.source.scenario).parameters), None) == "rng"
+            return self.source.scenario(*([rng] if takes_rng else []), **self.params)
+        extra = {"calibration": self.calibration} if self.calibration else {}
+        data = self.source.data(self.files, rng, **self.data_params, **extra)
+        log = getattr(data, "log", data)
+        self.made_of.extend(getattr(log, "files", self.files or ()))
+        return self.source.scenario(data, **self.params)
+
     def properties(self, scenario: Scenario) -> dict[str, Any]:
         """All that is needed to run it again."""
         files = [*self.made_of, *([self.calibration] if self.calibration else [])]
         return {
+            "title": self.title(),
             "scenario": self.source.name,
             "system": self.source.system,
             "params": self.all_params(),

@@ -121,7 +121,11 @@ def six_signals(folder: Path) -> list[tuple[str, str, str]]:
     figures = f"rr.log: {1e6 * theirs / fewer:.0f} µs"
     return [
         ("the recorder on six signals, a step", f"{1e6 * mine / count:.1f} µs (≤ 8)", figures),
-        ("its file / the raw float bytes", f"{path.stat().st_size / raw:.2f} (≤ 1.5)", f"{raw / count:.0f} bytes a step"),
+        (
+            "its file / the raw float bytes",
+            f"{path.stat().st_size / raw:.2f} (≤ 1.5)",
+            f"{raw / count:.0f} bytes a step",
+        ),
     ]
 
 

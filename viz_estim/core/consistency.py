@@ -19,8 +19,16 @@ _LEVEL = 0.95
 
 
 def squared_distance(error: Array, cov: Array) -> Array:
-    """eᵀ·P⁻¹·e (*,) of e (*, d) and P (*, d, d): NIS of a residual under S, NEES of an error under P."""
-    return (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(-1)
+    """eᵀ·P⁻¹·e (*,) of e (*, d) and P (*, d, d): NIS of a residual under S, NEES of an error under P.
+
+    NaN where P is singular.
+    """
+    try:
+        return (error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(-1)
+    except np.linalg.LinAlgError:
+        sound = np.linalg.matrix_rank(cov) == cov.shape[-1]
+        cov = np.where(sound[..., None, None], cov, np.eye(cov.shape[-1]))
+        return np.where(sound, squared_distance(error, cov), np.nan)
 
 
 def band(dof: int, count: int = 1, level: float = _LEVEL) -> tuple[float, float]:

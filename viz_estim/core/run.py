@@ -124,6 +124,7 @@ def run(scenario: Scenario, seed: int = 0) -> Iterator[Step]:
         assert belief is not None, "a scenario sets a belief at step 0"
         try:
             for stage in scenario.estimator.step(belief, tick, chance.at(k)):
+                _check_shapes(stage, scenario.space)
                 stages.append(stage)
                 belief = stage.belief
                 if not (np.isfinite(belief.mean).all() and np.isfinite(belief.cov).all()):
@@ -135,6 +136,19 @@ def run(scenario: Scenario, seed: int = 0) -> Iterator[Step]:
         yield Step(k, tick, tuple(stages), truth, error)
         if error:
             return
+
+
+def _check_shapes(stage: Any, space: Any) -> None:
+    """TypeError or ValueError where a person's filter yields what is no stage over the scenario's space."""
+    if not isinstance(stage, Stage):
+        raise TypeError(f"step() must yield stages, got {type(stage).__name__}")
+    n, d = len(space.names), len(space.axes)
+    belief: Any = stage.belief
+    for name, shape in (("mean", (n,)), ("cov", (d, d))):
+        value = getattr(belief, name, None)
+        if not isinstance(value, np.ndarray) or value.shape != shape:
+            got = value.shape if isinstance(value, np.ndarray) else type(value).__name__
+            raise ValueError(f"stage {stage.name}: expected a {name} of shape {shape}, got {got}")
 
 
 def _failing_stage(stages: list[Stage], failure: Exception) -> str:

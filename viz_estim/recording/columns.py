@@ -93,3 +93,15 @@ def drawn(archetype: Any, counts: int | np.ndarray, rows: int, **components: Arr
             batch = pa.array(np.asarray(values, float).ravel())
         columns.append(rr.ComponentColumn(descriptor, _Batch(batch), offsets=offsets))
     return columns
+
+
+def send_static(stream: rr.RecordingStream, path: str, archetype: Any) -> None:
+    """What `stream.log(path, archetype, static=True)` does, at once: a log waits in the stream's own batches, and comes
+    out among the columns in another order each time."""
+    batches = archetype.as_component_batches()
+    columns = [
+        rr.ComponentColumn(b.component_descriptor(), b, lengths=[len(b.as_arrow_array())])
+        for b in batches
+        if b.as_arrow_array() is not None
+    ]
+    rr.send_columns(path, [], columns, recording=stream, strict=True)

@@ -14,7 +14,7 @@ from viz_estim.core.run import Step
 from viz_estim.core.spaces import SO3, Euclidean, Product, Space
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
-from viz_estim.recording.columns import Times, drawn
+from viz_estim.recording.columns import Times, drawn, send_static
 from viz_estim.recording.layout import Layout
 
 Series = tuple[str, schema.Colour, Array]  # name, colour, values (N,)
@@ -26,6 +26,7 @@ class Plots:
     def __init__(self, stream: rr.RecordingStream, layout: Layout) -> None:
         self._stream, self._layout = stream, layout
         self._styled: set[str] = set()
+        self._known: dict[str, bool] = {}  # by broken line: whether it has a value last
         self._states: dict[str, str] = {}  # by lane: what it shows last
 
     def add(self, batch: Batch) -> None:
@@ -88,11 +89,11 @@ class Plots:
             series: list[Series] = []
             if reading is not None:
                 series.append((reading[0], self._colour(reading[0]), scale * reading[1][:, i]))
-            if name in self._layout.true_parts:
-                series.append(("truth", schema.TRUTH, scale * true[:, i]))
             series.append(("estimate", schema.ESTIMATE, scale * x[:, i]))
             path = schema.plot("state", f"{name}.{component}")
             self._plot(path, at, unit, series, scale**2 * var[:, i] if own_sigma else None)
+            if name in self._layout.true_parts:
+                self._broken(f"{path}/truth", at, unit, ("truth", schema.TRUTH, scale * true[:, i]))
 
     def _direct_reading(self, part: Space, steps: list[Step]) -> tuple[str, Array] | None:
         """The sensor that reads this part of the state as it is (a gyro reads the rate), and its readings."""
@@ -116,8 +117,9 @@ class Plots:
                 path, unit = schema.plot("innovation", f"{name}.{axis}"), part.axis_units[i - start]
                 self._within(path, rows.at, residual[:, i], S[:, i, i], "residual", colour, unit)
             low, high = (np.full(len(rows.at), bound) for bound in band(found[name].dof))
-            series = [("97.5 %", schema.BAND, high), ("2.5 %", schema.BAND, low), ("NIS", colour, found[name].values)]
-            self._plot(schema.plot("nis", name), rows.at, "", series)
+            path = schema.plot("nis", name)
+            self._plot(path, rows.at, "", [("97.5 %", schema.BAND, high), ("2.5 %", schema.BAND, low)])
+            self._broken(f"{path}/value", rows.at, "", ("NIS", colour, found[name].values))
 
     def _within(
         self, path: str, at: Times, value: Array, variance: Array, name: str, colour: schema.Colour, unit: str
@@ -125,24 +127,41 @@ class Plots:
         """A value between the lines at ±3σ that it should stay within."""
         unit, scale = _shown(unit)
         bound = 3 * scale * np.sqrt(np.maximum(variance, 0))
-        series = [("+3σ", schema.BAND, bound), ("−3σ", schema.BAND, -bound), (name, colour, scale * value)]
-        self._plot(path, at, unit, series)
+        self._plot(path, at, unit, [("+3σ", schema.BAND, bound), ("−3σ", schema.BAND, -bound)])
+        self._broken(f"{path}/value", at, unit, (name, colour, scale * value))
+
+    def _broken(self, path: str, at: Times, unit: str, series: Series) -> None:
+        """One line that is broken where its value is NaN: by a row without a value, where the gap begins."""
+        name, colour, values = series
+        known = np.isfinite(values)
+        before = np.concatenate([[self._known.get(path, False)], known[:-1]])
+        self._known[path] = bool(known[-1])
+        rows = np.flatnonzero(known | before)
+        if len(rows):
+            at, shown = (at, values) if len(rows) == len(at) and known.all() else (at.pick(rows), values[rows])
+            counts = np.isfinite(shown)
+            self._style(path, unit, [(name, colour, shown)])
+            columns = drawn(rr.Measurements, counts.astype(int), len(at), values=shown[counts])
+            rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)
 
     def _plot(self, path: str, at: Times, unit: str, series: list[Series], variance: Array | None = None) -> None:
         """Lines in one plot, the last on top; the variance (N,) is that one's, drawn as a band."""
-        if path not in self._styled:
-            self._styled.add(path)
-            names, colours, _ = zip(*series, strict=True)
-            style = rr.Measurements.from_fields(
-                names=names, colors=colours, units=[unit] * len(names), aggregation_policy="MinMax"
-            )
-            self._stream.log(path, style, static=True)
+        self._style(path, unit, series)
         components = {"values": np.stack([values for _, _, values in series], axis=1)}
         if variance is not None:
             components["variances"] = np.zeros_like(components["values"])
             components["variances"][:, -1] = variance
         columns = drawn(rr.Measurements, len(series), len(at), **components)
         rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)
+
+    def _style(self, path: str, unit: str, series: list[Series]) -> None:
+        if path not in self._styled:
+            self._styled.add(path)
+            names, colours, _ = zip(*series, strict=True)
+            style = rr.Measurements.from_fields(
+                names=names, colors=colours, units=[unit] * len(names), aggregation_policy="MinMax"
+            )
+            send_static(self._stream, path, style)
 
     def _lane(self, name: str, at: Times, states: list[str]) -> None:
         """A lane of states, written where they change."""
@@ -156,7 +175,7 @@ class Plots:
         if key not in self._styled:
             self._styled.add(key)
             style = rr.StateConfiguration(values=list(meanings), colors=list(meanings.values()))
-            self._stream.log(path, style, static=True)
+            send_static(self._stream, path, style)
         columns = rr.StateChange.columns(state=[states[i] for i in changed])
         rr.send_columns(path, at.pick(np.array(changed)).columns, columns, recording=self._stream, strict=True)
 

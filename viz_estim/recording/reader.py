@@ -19,6 +19,7 @@ from viz_estim.core.descriptions import rebuild
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
 from viz_estim.errors import BadInput
+from viz_estim.recording.layout import as_product
 from viz_estim.recording.rescue import whole
 
 
@@ -138,8 +139,10 @@ def load(path: str | Path, *, points: bool = True) -> Run:
     facts = {name: json.loads(text) for name, text in properties.items()}
     space = rebuild(facts["space"])
     index = steps.index()
-    inputs = {name: steps.column(name, (-1,)) for name in steps.names() if name not in ("dt", "truth")}
-    truth = steps.column("truth", (len(space.names),))
+    inputs = {name: steps.column(name, (-1,)) for name in steps.names() if not name.startswith(("dt", "truth"))}
+    truth = np.full((len(index["step"]), len(space.names)), np.nan)
+    for name, at in as_product(space).at.items():
+        truth[:, at] = steps.column(f"truth.{name}", (at.stop - at.start,))
     fields = facts.get("stages", {})
     known = [*(name for name in fields if name in stages), *(name for name in stages if name not in fields)]
     tables = {name: _table(name, stages[name], space, fields.get(name, {})) for name in known}

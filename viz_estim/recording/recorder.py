@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import threading
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -18,15 +19,17 @@ from viz_estim.core.run import Scenario, Step
 from viz_estim.core.stages import Innovation
 from viz_estim.recording import blueprints, schema
 from viz_estim.recording.batch import Batch, StageRows
-from viz_estim.recording.columns import Times, numbers
+from viz_estim.recording.columns import Times, numbers, send_static
 from viz_estim.recording.layout import Layout
 from viz_estim.recording.plots import Plots
 from viz_estim.recording.scenes import Scenes
 
-_ROWS = 1000
+# A batch is cut by its number of rows, which the same seed repeats; by time only where steps are so slow that a kill
+# would lose a second of them, or while a viewer watches.
+_ROWS = 400
 _BYTES = 8 << 20
-_SECONDS = 0.3
-_SECONDS_WATCHED = 0.05  # while a viewer watches
+_SECONDS = 0.6
+_SECONDS_WATCHED = 0.05
 
 Sink = rr.FileSink | rr.GrpcSink
 
@@ -63,15 +66,17 @@ class Recorder:
         self._stream = rr.RecordingStream(f"viz_estim {name}", send_properties=False)
         sinks: list[Sink] = [rr.FileSink(self.partial)]
         self._stream.set_sinks(*sinks, *([rr.GrpcSink(live)] if live else []))
-        self._stream.send_recording_name(path.stem)
+        self._stream.send_recording_name(str(properties.get("title", name)))
+        self._stream.flush()  # what is logged so far comes before all columns
         self._scenes = Scenes(self._stream, self._layout, scenario, every)
         self._plots = Plots(self._stream, self._layout)
         self._properties = dict(properties) | {"space": describe(scenario.space)}
         self._send_properties()
         notes = f"{scenario.notes}\n\n{schema.LEGEND}".strip()
-        self._stream.log(schema.NOTES, rr.TextDocument(notes, media_type="text/markdown"), static=True)
-        seconds = _SECONDS_WATCHED if live else _SECONDS
-        self._timer = threading.Thread(target=self._tick, args=(seconds,), daemon=True)
+        send_static(self._stream, schema.NOTES, rr.TextDocument(notes, media_type="text/markdown"))
+        self._patience = _SECONDS_WATCHED if live else _SECONDS
+        self._oldest = 0.0  # when the first of the buffered rows came
+        self._timer = threading.Thread(target=self._tick, daemon=True)
         self._timer.start()
 
     def add(self, step: Step) -> None:
@@ -79,6 +84,8 @@ class Recorder:
         if self._failed:
             raise self._failed
         with self._lock:
+            if not self._rows:
+                self._oldest = time.monotonic()
             self._rows.append(step)
             if len(self._rows) >= self._limit:
                 self._flush()
@@ -115,11 +122,12 @@ class Recorder:
         self._stream.flush()
         self._stream.disconnect()
 
-    def _tick(self, seconds: float) -> None:
-        while not self._closed.wait(seconds):
+    def _tick(self) -> None:
+        while not self._closed.wait(self._patience / 4):
             with self._lock:
                 try:
-                    self._flush()
+                    if self._rows and time.monotonic() - self._oldest >= self._patience:
+                        self._flush()
                     self._stream.flush()  # to the file, for a kill may come
                 except Exception as error:  # told at the next step, in the thread that can act on it
                     self._failed = error
@@ -127,7 +135,7 @@ class Recorder:
 
     def _send_properties(self) -> None:
         texts = {name: json.dumps(value) for name, value in (self._properties | self._layout.as_json()).items()}
-        self._stream.send_property("viz_estim", rr.AnyValues(drop_untyped_nones=False, **texts))
+        send_static(self._stream, "/__properties/viz_estim", rr.AnyValues(drop_untyped_nones=False, **texts))
 
     def _flush(self) -> None:
         """Sends what is buffered: the steps, their stages by name, and what is drawn of them."""
@@ -161,7 +169,13 @@ class Recorder:
     def _send_steps(self, batch: Batch) -> None:
         steps = batch.steps
         columns = [numbers("viz_estim.Step", "dt", np.array([step.tick.dt for step in steps]))]
-        optional = {"truth": [s.truth for s in steps], "control": [s.tick.control for s in steps]}
+        # By part, and absent where it is not known: NaN is never written, for it compares unequal to itself.
+        optional: dict[str, list[Any]] = {"control": [step.tick.control for step in steps]}
+        truth = batch.truth(len(self._layout.space.names))
+        for part in self._layout.true_parts:
+            values = truth[:, self._layout.space.at[part]]
+            missing = set(np.flatnonzero(~np.isfinite(values).all(axis=1)).tolist())
+            optional[f"truth.{part}"] = [None if row in missing else x for row, x in enumerate(values)]
         for sensor in self._layout.inputs:
             optional[f"z.{sensor}"] = [s.tick.measurements.get(sensor) for s in steps]
             optional[f"raw.{sensor}"] = [s.tick.raw.get(sensor) for s in steps]

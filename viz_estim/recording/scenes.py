@@ -15,7 +15,7 @@ from viz_estim.core.run import Scenario
 from viz_estim.core.spaces import S2, SO3, Euclidean
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
-from viz_estim.recording.columns import Times, drawn
+from viz_estim.recording.columns import Times, drawn, send_static
 from viz_estim.recording.layout import Layout, as_product
 
 _DEFAULT_BODY = (0.6, 0.4, 0.15)
@@ -34,7 +34,7 @@ class Scenes:
         body = scenario.scenery.get("body")
         self._body = np.array(body.sizes if body else _DEFAULT_BODY) / 2
         if any(isinstance(part, SO3) for part in layout.space.parts.values()):
-            stream.log(schema.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            send_static(stream, schema.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
             self._sphere(f"{schema.WORLD}/sphere", 1.0)
 
     def add(self, batch: Batch) -> None:
@@ -68,12 +68,12 @@ class Scenes:
             self._styled.add(box)
             estimated = name == "estimate"
             edges = rr.Boxes3D.from_fields(colors=[colour], labels=[name], show_labels=False, radii=[0.006])
-            self._stream.log(box, edges, static=True)
+            send_static(self._stream, box, edges)
             pale = [tuple(np.add(c, schema.TRUTH) // 2) for c in schema.AXES]
             arrows = rr.Arrows3D.from_fields(
                 colors=schema.AXES if estimated else pale, radii=[0.012 if estimated else 0.006] * 3
             )
-            self._stream.log(axes, arrows, static=True)
+            send_static(self._stream, axes, arrows)
         known = np.isfinite(q).all(1)
         q = q[known]
         sizes = np.broadcast_to(self._body, (len(q), 3))
@@ -95,7 +95,7 @@ class Scenes:
                 self._stand(rows.name, path, at, rr.Points3D, _tips(x), 3 * count, colours, 0.014 / faint**0.5)
             elif name in self._layout.sensors and len(part.names) == 3:
                 size = self._layout.reach[name]
-                path = f"{schema.sensor(name)}/{field}"
+                path = f"{schema.sensor(name)}/{rows.name}/{field}"
                 self._stand(rows.name, path, at, rr.Points3D, x, count, [schema.ESTIMATE], 0.014 * size)
 
     def _draw_readings(self, rows: StageRows, field: str, at: Times, kept: np.ndarray) -> None:
@@ -109,9 +109,16 @@ class Scenes:
                     self._styled.add(path)
                     self._sphere(f"{path}/sphere", size)
                 colour = schema.sensor_colour(self._layout.place(name))[1]
-                self._stand(rows.name, f"{path}/measured", at, rr.Arrows3D, z, 1, [colour], 0.012 * size)
+                self._stand(rows.name, f"{path}/{rows.name}/measured", at, rr.Arrows3D, z, 1, [colour], 0.012 * size)
                 self._stand(
-                    rows.name, f"{path}/predicted", at, rr.Arrows3D, expected, 1, [schema.ESTIMATE], 0.012 * size
+                    rows.name,
+                    f"{path}/{rows.name}/predicted",
+                    at,
+                    rr.Arrows3D,
+                    expected,
+                    1,
+                    [schema.ESTIMATE],
+                    0.012 * size,
                 )
 
     def _stand(
@@ -122,7 +129,7 @@ class Scenes:
         if path not in self._styled:
             self._styled.add(path)
             self._paths.setdefault(stage, {})[path] = kind
-            self._stream.log(path, kind.from_fields(colors=colours, radii=[radius]), static=True)
+            send_static(self._stream, path, kind.from_fields(colors=colours, radii=[radius]))
         self._send(path, at, drawn(kind, count, len(at), **{_SHAPES[kind]: values}))
 
     def _clear(self, batch: Batch) -> None:
@@ -162,7 +169,7 @@ class Scenes:
             centers=[[0, 0, 0]], half_sizes=[[radius] * 3], fill_mode="MajorWireframe",
             colors=[(70, 70, 78)], line_radii=[0.003 * radius],
         )  # fmt: skip
-        self._stream.log(path, sphere, static=True)
+        send_static(self._stream, path, sphere)
 
     def _send(self, path: str, at: Times, columns: list[rr.ComponentColumn]) -> None:
         rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)

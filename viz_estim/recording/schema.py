@@ -87,7 +87,9 @@ class Entry(NamedTuple):
 _SENSOR_S, _PART_S, _TANGENT = "the sensor's", "the part's", "body (tangent at the estimate)"
 ENTITIES = (
     Entry(
-        STEPS, "`viz_estim.Step`: dt, truth, control; of each sensor `z.<sensor>` and `raw.<sensor>`", "SI, rad; counts"
+        STEPS,
+        "`viz_estim.Step`: dt, control, `truth.<part>`, `z.<sensor>`, `raw.<sensor>`",
+        "SI, rad; counts",
     ),
     Entry(
         "/stages/{stage}",
@@ -100,9 +102,9 @@ ENTITIES = (
     Entry(
         "/world/{stage}/{points}", "`Points3D`: an attitude's sigma points, as tips of the body's axes", "1", "world"
     ),
-    Entry("/sensors/{sensor}/mapped", "`Points3D`: sigma points mapped into the measurement", _SENSOR_S, "body"),
-    Entry("/sensors/{sensor}/measured", "`Arrows3D`: the reading", _SENSOR_S, "body"),
-    Entry("/sensors/{sensor}/predicted", "`Arrows3D`: the mean of what was expected", _SENSOR_S, "body"),
+    Entry("/sensors/{sensor}/{stage}/mapped", "`Points3D`: sigma points in the measurement", _SENSOR_S, "body"),
+    Entry("/sensors/{sensor}/{stage}/measured", "`Arrows3D`: the reading", _SENSOR_S, "body"),
+    Entry("/sensors/{sensor}/{stage}/predicted", "`Arrows3D`: the mean of what was expected", _SENSOR_S, "body"),
     Entry(
         "/plots/state/{part}.{component}",
         "`Measurements`: the estimate with its ±1σ band, the truth, the sensor that reads it",

@@ -77,12 +77,12 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
         """Opens recordings, waits until each has loaded, and stops the cursor, for the viewer plays what it opens."""
         for path in map(_existing, paths):
             with whole(path) as sound:  # of a run that was killed, what is sound
-                self._load(sound)
+                self._load(path, sound)
 
-    def _load(self, path: Path) -> None:
+    def _load(self, path: Path, sound: Path) -> None:
         self._forget()
         known = {recording.store_id for recording in self._state().recordings}
-        opened = self._ask(self._client.open, str(path)).store_ids
+        opened = self._ask(self._client.open, str(sound)).store_ids
         for _ in _polls(LOAD_S + path.stat().st_size / LOAD_BYTES_PER_S):
             state = self._state()
             new = [r for r in state.recordings if (r.store_id in opened if opened else r.store_id not in known)]
@@ -90,7 +90,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
             if new and not state.loading and all(recording.timelines for recording in new):
                 break
             if not new and (errors := self._logged("ERROR")):  # "Failed to … File path: P: CAUSE File path: P"
-                cause = errors[-1].removesuffix(f" File path: {path}").split(f"{path}: ")[-1]
+                cause = errors[-1].removesuffix(f" File path: {sound}").split(f"{sound}: ")[-1]
                 raise ViewerError(f"{path}: damaged or not a recording ({cause}); record it again")
         else:
             raise ViewerError(f"{path}: has no data on any timeline; is it a recording?")
