@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from operator import attrgetter
 from typing import Any
 
@@ -73,7 +74,9 @@ class Batch:
         stages = [steps[row].stages[i] for row, i in zip(rows.tolist(), offsets.tolist(), strict=True)]
         return StageRows(name, stages, Times(self.times.step[rows], self.times.time[rows], places), rows, last)
 
-    def truth(self, size: int) -> Array:
-        """The truth (N, size), NaN where there is none."""
+    @cached_property
+    def truth(self) -> Array:
+        """The truth (N, n), NaN where there is none; of a run that has one."""
+        size = next((len(step.truth) for step in self.steps if step.truth is not None), 0)
         nothing = np.full(size, np.nan)
         return np.array([nothing if step.truth is None else step.truth for step in self.steps])

@@ -60,7 +60,7 @@ class Plots:
         mean = np.concatenate([rows.array("belief.mean")[last] for rows, last in ends])[order]
         cov = np.concatenate([rows.array("belief.cov")[last] for rows, last in ends])[order]
         variance = np.diagonal(cov, axis1=1, axis2=2)
-        truth = batch.truth(mean.shape[1])[row]
+        truth = batch.truth[row] if self._layout.true_parts else np.broadcast_to(np.nan, mean.shape)
         space = self._layout.space
         for name, part in space.parts.items():
             x, true, var = mean[:, space.at[name]], truth[:, space.at[name]], variance[:, space.axes_at[name]]

@@ -24,10 +24,10 @@ from viz_estim.recording.layout import Layout
 from viz_estim.recording.plots import Plots
 from viz_estim.recording.scenes import Scenes
 
-# A batch is cut by its number of rows, which the same seed repeats; by time only where steps are so slow that a kill
-# would lose a second of them, or while a viewer watches.
-_ROWS = 400
-_BYTES = 8 << 20
+# A batch is cut by rows and bytes, which the same seed repeats; by time only where steps are so slow that a kill would
+# lose a second of them, or while a viewer watches.
+_ROWS = 1000
+_BYTES = 3 << 19
 _SECONDS = 0.6
 _SECONDS_WATCHED = 0.05
 
@@ -171,9 +171,8 @@ class Recorder:
         columns = [numbers("viz_estim.Step", "dt", np.array([step.tick.dt for step in steps]))]
         # By part, and absent where it is not known: NaN is never written, for it compares unequal to itself.
         optional: dict[str, list[Any]] = {"control": [step.tick.control for step in steps]}
-        truth = batch.truth(len(self._layout.space.names))
         for part in self._layout.true_parts:
-            values = truth[:, self._layout.space.at[part]]
+            values = batch.truth[:, self._layout.space.at[part]]
             missing = set(np.flatnonzero(~np.isfinite(values).all(axis=1)).tolist())
             optional[f"truth.{part}"] = [None if row in missing else x for row, x in enumerate(values)]
         for sensor in self._layout.inputs:

@@ -59,7 +59,7 @@ class Scenes:
                     q = rows.array("belief.mean")[:, space.at[name]]
                     self._body_at("estimate", rows.at, q, schema.ESTIMATE, 1.0)
                 if name in self._layout.true_parts:
-                    q = batch.truth(len(space.names))[:, space.at[name]]
+                    q = batch.truth[:, space.at[name]]
                     self._body_at("truth", batch.times, q, schema.TRUTH, 1.25)
 
     def _body_at(self, name: str, at: Times, q: Array, colour: schema.Colour, reach: float) -> None:
