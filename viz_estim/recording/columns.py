@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
@@ -62,6 +63,9 @@ def _named(archetype: str, component: str) -> rr.ComponentDescriptor:
 
 def numbers(archetype: str, component: str, rows: Array | Sequence[Array | None]) -> rr.ComponentColumn:
     """Float64 arrays as one column, bit for bit, row-major; rows may be None or of several lengths."""
+    if not isinstance(rows, np.ndarray) and not any(row is None for row in rows):
+        with suppress(ValueError):  # of several lengths
+            rows = np.array(rows, dtype=float)
     if isinstance(rows, np.ndarray):
         flat, counts = np.asarray(rows, float).ravel(), _offsets(rows.size // max(1, len(rows)), len(rows))
     else:
