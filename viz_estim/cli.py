@@ -188,22 +188,31 @@ def _show(arguments: argparse.Namespace) -> None:
 
 
 def _snapshot(arguments: argparse.Namespace) -> None:
-    from viz_estim.recording.reader import load
+    from viz_estim.recording.reader import NotARun
     from viz_estim.recording.viewer import snapshot
 
     check_writable(arguments.out, suffix=".png")
-    run = load(arguments.file, points=False)
-    if arguments.stage is not None:
-        moment: tuple[str, float] = ("stage", run.place(arguments.stage))
-    else:
-        step, seconds = arguments.step, arguments.time
-        row = len(run.step) - 1 if step is None and seconds is None else run.row(step=step, time=seconds)
-        # A moment is shown on the timeline it was asked for; its own stamp is where a row surely lies.
-        moment = ("step", int(run.step[row])) if seconds is None else ("time", float(run.time[row]))
-    timeline, value = moment
+    try:
+        timeline, value = _asked(arguments)
+    except NotARun:  # such as a calibration's picture: the viewer knows its moments
+        given = {"step": arguments.step, "time": arguments.time, "stage": arguments.stage}
+        timeline, value = next(((name, v) for name, v in given.items() if v is not None), ("time", None))
     for problem in snapshot(arguments.file, arguments.out, timeline=timeline, value=value, size=arguments.size):
         print(f"viz-estim: {problem}", file=sys.stderr)
     print(arguments.out)
+
+
+def _asked(arguments: argparse.Namespace) -> tuple[str, float | None]:
+    """The moment of a run that a person asked for, on the timeline they named; its last step if they named none."""
+    from viz_estim.recording.reader import load
+
+    run = load(arguments.file, points=False)
+    if arguments.stage is not None:
+        return "stage", run.place(arguments.stage)
+    if arguments.time is not None:
+        # The step's own stamp is where a row surely lies.
+        return "time", float(run.time[run.row(time=arguments.time)])
+    return "step", int(run.step[-1] if arguments.step is None else run.step[run.row(step=arguments.step)])
 
 
 def _calibrate(arguments: argparse.Namespace) -> None:

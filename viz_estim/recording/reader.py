@@ -23,6 +23,10 @@ from viz_estim.recording.layout import as_product
 from viz_estim.recording.rescue import whole
 
 
+class NotARun(BadInput):
+    """A sound recording, but not of a run: a calibration's picture, or another program's."""
+
+
 @dataclass(frozen=True)
 class StageTable:
     """All rows of one stage: step (M,), place (M,) on the stage timeline, and its numbers by name, (M, …).
@@ -135,7 +139,7 @@ def load(path: str | Path, *, points: bool = True) -> Run:
         elif entity.startswith("/stages/"):
             stages.setdefault(entity.removeprefix("/stages/"), _Gathered(points)).add(chunk.to_record_batch())
     if "space" not in properties or not steps.times:
-        raise BadInput(f"{path}: holds no run of viz_estim (make one with `viz-estim run`)")
+        raise NotARun(f"{path}: holds no run of viz_estim (make one with `viz-estim run`)")
     facts = {name: json.loads(text) for name, text in properties.items()}
     space = rebuild(facts["space"])
     index = steps.index()
