@@ -125,7 +125,8 @@ def plan(
             data = [own]
     if data and source.data and (changed := [k for k, v in data_params.items() if v != data_parameters[k].default]):
         raise BadInput(f"data.{changed[0]} belongs to the simulation; leave it out, or give --seed instead of --data")
-    return Plan(source, params, data_params, data or None, calibration, seed or 0)
+    # The simulation's parameters say nothing of data that was read.
+    return Plan(source, params, {} if data else data_params, data or None, calibration, seed or 0)
 
 
 def find(name: str) -> Source:

@@ -69,7 +69,7 @@ class SixSignals(Stage):
 
 
 def six_signals(folder: Path) -> list[tuple[str, str, str]]:
-    count, rng = 20_000, np.random.default_rng(2)
+    count, rng = 40_000, np.random.default_rng(2)
     names = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
     space, cube = Euclidean(names), Euclidean(("x", "y", "z"))
     data = {k: rng.standard_normal((count, n)) for k, n in (("mean", 7), ("rate", 3), ("bias", 3), ("force", 3))}
