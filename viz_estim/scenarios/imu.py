@@ -54,9 +54,9 @@ def imu(
             names = ", ".join(str(file.name) for file, _ in sets)
             raise BadInput(f"{len(sets)} IMU files found, a run takes one: name one of {names}")
         return prepare(imu_files.load(*sets[0]), calibration)
-    if duration < still + 2.0 or still < 0 or freeze < 0 or noise_scale < 0:
+    if duration < still + max(2.0, freeze + 0.5) or min(still, freeze, noise_scale) < 0:
         raise BadInput(
-            "a simulation needs duration ≥ still + 2 s, and still, freeze, noise_scale not negative: "
+            "a simulation needs duration ≥ still + 2 s and ≥ still + freeze + 0.5 s, none of them negative: "
             f"got duration={duration:g}, still={still:g}, freeze={freeze:g}, noise_scale={noise_scale:g}"
         )
     log, _ = imu_simulation.simulate(rng, duration=duration, still=still, freeze=freeze, noise_scale=noise_scale)
