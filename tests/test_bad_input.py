@@ -108,6 +108,12 @@ BAD_COMMANDS: dict[str, tuple[list[str], str]] = {
     "show: no such time": (["show", "{rec}", "--time", "99"], "no step at 99"),
     "show: time that is no number": (["show", "{rec}", "--time", "nan"], "nan"),
     "show: step and time": (["show", "{rec}", "--step", "1", "--time", "1"], "not allowed"),
+    "export: over its own recording": (["export", "{rec}", "--to", "csv", "-o", "{rec}"], "must end in .csv"),
+    "run: a calibration as data": (["run", "imu-ukf", "--data", "{}/text.json"], "expected a data file"),
+    "run: no such calibration": (
+        ["run", "imu-ukf", "--seed", "1", "--calibration", "{}/no.json"],
+        "no such calibration",
+    ),
     "snapshot: no such step": (["snapshot", "{rec}", "--step", "9999", "-o", "{}/a.png"], "no step 9999"),
     "snapshot: no such stage": (["snapshot", "{rec}", "--stage", "9999", "-o", "{}/a.png"], "no stage 9999"),
     "snapshot: no such time": (["snapshot", "{rec}", "--time", "-3", "-o", "{}/a.png"], "no step at -3"),

@@ -189,7 +189,7 @@ def _show(arguments: argparse.Namespace) -> None:
 
 def _snapshot(arguments: argparse.Namespace) -> None:
     from viz_estim.recording.reader import NotARun
-    from viz_estim.recording.viewer import snapshot
+    from viz_estim.recording.viewer import ViewerError, snapshot
 
     check_writable(arguments.out, suffix=".png")
     try:
@@ -197,7 +197,12 @@ def _snapshot(arguments: argparse.Namespace) -> None:
     except NotARun:  # such as a calibration's picture: the viewer knows its moments
         given = {"step": arguments.step, "time": arguments.time, "stage": arguments.stage}
         timeline, value = next(((name, v) for name, v in given.items() if v is not None), ("time", None))
-    for problem in snapshot(arguments.file, arguments.out, timeline=timeline, value=value, size=arguments.size):
+    try:
+        problems = snapshot(arguments.file, arguments.out, timeline=timeline, value=value, size=arguments.size)
+    except ViewerError as error:
+        known = str(error).startswith(str(arguments.file))
+        raise error if known else ViewerError(f"{arguments.file}: {error}") from error
+    for problem in problems:
         print(f"viz-estim: {problem}", file=sys.stderr)
     print(arguments.out)
 
@@ -239,6 +244,9 @@ def _export(arguments: argparse.Namespace) -> None:
     from viz_estim.export import export
     from viz_estim.recording.reader import load
 
+    endings = {"csv": (".csv",), "npz": (".npz",), "tum": (".tum", ".txt")}[arguments.to]
+    if arguments.out.suffix not in endings:  # else a slip would write over a recording, or over data
+        raise BadInput(f"{arguments.out}: the output of --to {arguments.to} must end in {' or '.join(endings)}")
     check_writable(arguments.out)
     for path in export(load(arguments.file), arguments.to, arguments.out):
         print(path)

@@ -67,6 +67,8 @@ DOCUMENTED = Calibration(
 
 def load(path: Path) -> Calibration:
     """The constants that `calibrate imu` wrote."""
+    if not path.is_file():
+        raise BadInput(f"{path}: no such calibration; make one with `calibrate imu --data … --out FILE`")
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except (UnicodeDecodeError, json.JSONDecodeError) as error:

@@ -103,6 +103,8 @@ def _expand(path: Path) -> list[Path]:
 
 def _role(path: Path, *, strict: bool) -> str | None:
     """imu, truth, camera or None by the file's fields; None is an error for a file that was named itself."""
+    if path.suffix.lower() not in _SUFFIXES:
+        raise BadInput(f"{path}: expected a data file that ends in {', '.join(_SUFFIXES)}")
     try:
         if path.suffix.lower() == ".mat":
             fields = {name for name, *_ in scipy.io.whosmat(path)}
@@ -129,8 +131,10 @@ def _truth_of(imu: Path, truths: list[Path]) -> Path | None:
     number = _number(imu)
     if number is None:
         return None
-    beside = [imu.parent / f"viconRot{number}.mat", imu.parent.parent / "vicon" / f"viconRot{number}.mat"]
-    return next((t for t in truths if _number(t) == number), next((t for t in beside if t.exists()), None))
+    folders = [folder for folder in (imu.parent, imu.parent.parent / "vicon") if folder.is_dir()]
+    beside = [file for folder in folders for file in sorted(folder.iterdir())]
+    named = (file for file in beside if file.name.lower() == f"viconrot{number}.mat")
+    return next((t for t in truths if _number(t) == number), next(named, None))
 
 
 def _number(path: Path) -> str | None:
