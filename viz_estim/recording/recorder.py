@@ -123,15 +123,19 @@ class Recorder:
         self._stream.disconnect()
 
     def _tick(self) -> None:
+        written = 0
         while not self._closed.wait(self._patience / 4):
-            with self._lock:
-                try:
+            try:
+                with self._lock:
                     if self._rows and time.monotonic() - self._oldest >= self._patience:
                         self._flush()
-                    self._stream.flush()  # to the file, for a kill may come
-                except Exception as error:  # told at the next step, in the thread that can act on it
-                    self._failed = error
-                    return
+                    places = self._places
+                if places != written:  # to the file, for a kill may come; steps go on meanwhile
+                    self._stream.flush()
+                    written = places
+            except Exception as error:  # told at the next step, in the thread that can act on it
+                self._failed = error
+                return
 
     def _send_properties(self) -> None:
         texts = {name: json.dumps(value) for name, value in (self._properties | self._layout.as_json()).items()}
