@@ -15,6 +15,8 @@ from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, whole
 from viz_estim.parameters import nearest
 
+_ENDINGS = {"tum": (".tum", ".txt"), "csv": (".csv",), "npz": (".npz",)}  # of what `export` writes
+
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns the exit code: 0 done, 1 the answer is "no", 2 wrong usage or bad input."""
@@ -99,7 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     _json(p)
     p = command("export", _export, "a recording for other tools")
     p.add_argument("file", type=Path, metavar="FILE")
-    p.add_argument("--to", required=True, choices=["tum", "csv", "npz"], metavar="tum|csv|npz")
+    p.add_argument("--to", required=True, choices=list(_ENDINGS), metavar="tum|csv|npz")
     p.add_argument("-o", "--out", type=Path, required=True, metavar="OUT")
     p = command("simulate", _simulate, "write data files in the formats that the scenarios read")
     p.add_argument("system", metavar="SYSTEM")
@@ -244,7 +246,7 @@ def _export(arguments: argparse.Namespace) -> None:
     from viz_estim.export import export
     from viz_estim.recording.reader import load
 
-    endings = {"csv": (".csv",), "npz": (".npz",), "tum": (".tum", ".txt")}[arguments.to]
+    endings = _ENDINGS[arguments.to]
     if arguments.out.suffix not in endings:  # else a slip would write over a recording, or over data
         raise BadInput(f"{arguments.out}: the output of --to {arguments.to} must end in {' or '.join(endings)}")
     check_writable(arguments.out)

@@ -17,8 +17,6 @@ from viz_estim.files import whole
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.reader import Run
 
-FORMATS = ("tum", "csv", "npz")
-
 
 def export(run: Run, kind: str, out: Path) -> list[Path]:
     """Writes the run as `kind` and returns the files written; each appears whole or not at all."""

@@ -182,14 +182,12 @@ def _data_function(module: Any, scenario: Callable[..., Any], name: str) -> Call
     return chosen[0]
 
 
-def recorded(
-    steps: Iterator[Step], scenario: Scenario, recorder: Recorder, progress: Progress
-) -> tuple[dict[str, Any], list[Step]]:
-    """Runs the steps into the recorder; the result as `run --json` has it, and the failed step if there is one."""
+def recorded(steps: Iterator[Step], scenario: Scenario, recorder: Recorder, progress: Progress) -> dict[str, Any]:
+    """Runs the steps into the recorder; the result as `run --json` has it."""
     tally = Tally(scenario.space, max(scenario.beliefs))
     estimate = record = 0.0
     count = stages = 0
-    failed: list[Step] = []
+    error = None
     while True:
         began = time.perf_counter()
         step = next(steps, None)
@@ -201,10 +199,9 @@ def recorded(
         tally.add(step)
         record += time.perf_counter() - estimated
         count, stages = count + 1, stages + len(step.stages)
-        failed += [step] if step.error else []
+        error = step.error
         progress(count, len(scenario.ticks))
     last = scenario.ticks[max(count - 1, 0)].time
-    error = failed[0].error if failed else None
     result = {
         "steps": count,
         "stages": stages,
@@ -215,7 +212,7 @@ def recorded(
     began = time.perf_counter()
     recorder.close(result)
     record += time.perf_counter() - began
-    return result | {"wall_s": {"estimate": estimate, "record": record}}, failed
+    return result | {"wall_s": {"estimate": estimate, "record": record}}
 
 
 def execute(planned: Plan, out: Path | None, *, every: int, live: str | None, progress: Progress) -> dict[str, Any]:
@@ -227,6 +224,6 @@ def execute(planned: Plan, out: Path | None, *, every: int, live: str | None, pr
     check_writable(path, suffix=".rrd")
     properties = planned.properties(scenario)
     with Recorder(path, scenario, properties, every=every, live=live) as recorder:
-        result, _ = recorded(run(scenario, planned.seed), scenario, recorder, progress)
+        result = recorded(run(scenario, planned.seed), scenario, recorder, progress)
     head = {"scenario": planned.source.name, "recording": str(path)}
     return head | {"params": planned.all_params(), "seed": planned.seed} | result

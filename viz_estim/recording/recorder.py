@@ -31,8 +31,6 @@ _BYTES = 3 << 19
 _SECONDS = 0.6
 _SECONDS_WATCHED = 0.05
 
-Sink = rr.FileSink | rr.GrpcSink
-
 
 class Recorder:
     """Writes a run's steps to `path`, as `NAME.partial.rrd` until it is closed well, and to a live viewer beside it.
@@ -64,8 +62,7 @@ class Recorder:
         name = str(properties.get("scenario", path.stem))
         # A view belongs to an application id: runs of one scenario share what a person arranges in the viewer.
         self._stream = rr.RecordingStream(f"viz_estim {name}", send_properties=False)
-        sinks: list[Sink] = [rr.FileSink(self.partial)]
-        self._stream.set_sinks(*sinks, *([rr.GrpcSink(live)] if live else []))
+        self._stream.set_sinks(rr.FileSink(self.partial), *([rr.GrpcSink(live)] if live else []))
         self._stream.send_recording_name(str(properties.get("title", name)))
         self._stream.flush()  # what is logged so far comes before all columns
         self._scenes = Scenes(self._stream, self._layout, scenario, every)
