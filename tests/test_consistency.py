@@ -10,13 +10,13 @@ import pytest
 from scipy.stats import chi2
 
 from viz_estim.core import consistency, quaternions
-from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.beliefs import Gaussian, normal
 from viz_estim.core.consistency import Tally, band, metrics, nees, nees_summary, nis, rms, squared_distance
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario, StandIn, Tick, run
 from viz_estim.core.spaces import S2, SE2, SO3, Euclidean, Product
 from viz_estim.core.stages import UnscentedUpdate
-from viz_estim.core.unscented import UnscentedFilter, normal
+from viz_estim.core.unscented import UnscentedFilter
 from viz_estim.scenarios import imu
 
 SEEDS, STEPS, WARM = 50, 1000, 100  # WARM: the first second

@@ -14,11 +14,12 @@ from rerun.chunk import RrdReader
 
 import viz_estim
 from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.measurement import Measurement, Sensor
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario, Step, Tick, run
 from viz_estim.core.spaces import SO3, Euclidean, Product
 from viz_estim.core.stages import Innovation, SigmaPoints, Stage
-from viz_estim.core.unscented import Measurement, Sensor, predict, symmetric, update
+from viz_estim.core.unscented import predict, symmetric, update
 from viz_estim.parameters import parameters
 from viz_estim.recording.reader import Run
 from viz_estim.recording.recorder import Recorder

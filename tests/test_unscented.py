@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from viz_estim.core import quaternions, unscented
 from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.measurement import Measurement, Sensor
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick, run
 from viz_estim.core.spaces import SO3, Euclidean, Product
 from viz_estim.core.stages import SigmaPoints
-from viz_estim.core.unscented import Measurement, Rule, Sensor, scaled, symmetric, update
+from viz_estim.core.unscented import Rule, scaled, symmetric, update
 from viz_estim.scenarios import imu
 
 RULES = [symmetric, *(partial(scaled, alpha=a, beta=b, kappa=k) for a, b, k in [(1, 2, 0), (0.5, 0, 1), (1e-2, 2, -1)])]

@@ -17,11 +17,12 @@ import rerun as rr
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.measurement import Measurement, Sensor
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario, Step, Tick, run
 from viz_estim.core.spaces import Euclidean, Product
 from viz_estim.core.stages import SigmaPoints, Stage
-from viz_estim.core.unscented import Measurement, Sensor, UnscentedFilter, scaled
+from viz_estim.core.unscented import UnscentedFilter, scaled
 from viz_estim.recording.recorder import Recorder
 from viz_estim.scenarios.imu import imu, imu_ukf
 

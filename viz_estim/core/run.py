@@ -10,6 +10,7 @@ import numpy as np
 
 from viz_estim.core.beliefs import Belief
 from viz_estim.core.quaternions import Array
+from viz_estim.core.scenery import Scenery
 from viz_estim.core.stages import Stage, Start
 
 
@@ -69,27 +70,21 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Box:
-    """The estimated body as a box: sizes (x, y, z) in metres along its body axes."""
-
-    sizes: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
 class Scenario:
     """An estimator over data.
 
     beliefs: by step, the belief that is set there; step 0 must have one. The steps before the last one count in no
-    metric. truth (T, n), NaN where it is absent, or None. scenery: what else stands in the scene. notes: what to look
-    at, as markdown.
+    metric. truth (T, n), NaN where it is absent, or None. scenery: what else stands in the scene, by name. notes: what
+    to look at, as markdown. facts: figures known beforehand, printed among the metrics; names carry their units.
     """
 
     estimator: Estimator
     beliefs: Mapping[int, Belief]
     ticks: Sequence[Tick]
     truth: Array | None = None
-    scenery: Mapping[str, Box] = field(default_factory=dict)
+    scenery: Mapping[str, Scenery] = field(default_factory=dict)
     notes: str = ""
+    facts: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def space(self) -> Any:

@@ -23,6 +23,7 @@ class Space(Protocol):
     units: tuple[str, ...]
     axes: tuple[str, ...]
     axis_units: tuple[str, ...]
+    flat: bool  # `transport` is the identity everywhere
 
     def plus(self, x: Array, delta: Array) -> Array:
         """x (*, n) moved by delta (*, d)."""
@@ -83,6 +84,8 @@ def _identity(delta: Array) -> Array:
 class Euclidean:
     """R^n with named components in one unit (or one unit each)."""
 
+    flat = True
+
     def __init__(self, names: Sequence[str], units: Sequence[str] | str = "") -> None:
         if isinstance(names, str):
             raise ValueError(f"expected a sequence of names such as ('x', 'y'), got the text {names!r}")
@@ -106,6 +109,7 @@ class Euclidean:
 class SO2:
     """An angle in radians, kept in [−π, π)."""
 
+    flat = True
     names: tuple[str, ...] = ("angle",)
     axes: tuple[str, ...] = names
     units: tuple[str, ...] = ("rad",)
@@ -127,6 +131,7 @@ class SO2:
 class SO3:
     """An attitude as a unit quaternion (w, x, y, z), body → world; changes are rotation vectors in the body frame."""
 
+    flat = False
     names: tuple[str, ...] = ("qw", "qx", "qy", "qz")
     units: tuple[str, ...] = ("", "", "", "")
     axes: tuple[str, ...] = ("x", "y", "z")
@@ -152,6 +157,7 @@ class SO3:
 class SE2:
     """A pose (x, y, θ) in the plane, body → world; changes (dx, dy, dθ) are twists in the body frame."""
 
+    flat = False
     names: tuple[str, ...] = ("x", "y", "theta")
     units: tuple[str, ...] = ("m", "m", "rad")
     axes: tuple[str, ...] = ("forward", "left", "turn")
@@ -195,6 +201,7 @@ class S2:
     Hertzberg et al. (2013): the sphere as a ⊞-manifold.
     """
 
+    flat = False
     names: tuple[str, ...] = ("x", "y", "z")
     units: tuple[str, ...] = ("", "", "")
     axes: tuple[str, ...] = ("tangent_1", "tangent_2")
@@ -260,6 +267,7 @@ class Product:
         self.axes = tuple(f"{name}.{c}" for name, part in parts.items() for c in part.axes)
         self.units = tuple(u for part in parts.values() for u in part.units)
         self.axis_units = tuple(u for part in parts.values() for u in part.axis_units)
+        self.flat = all(part.flat for part in parts.values())
 
     def plus(self, x: Array, delta: Array) -> Array:
         return np.concatenate(

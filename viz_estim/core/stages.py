@@ -71,6 +71,14 @@ class Predict(Stage):
 
 
 @dataclass(frozen=True, slots=True)
+class LinearPredict(Predict):
+    """A prediction by a linear model, or a linearised one: P' = F·P·Fᵀ + Q; transition F, noise Q (*, d, d)."""
+
+    transition: Array
+    noise: Array
+
+
+@dataclass(frozen=True, slots=True)
 class UnscentedPredict(Predict):
     """A prediction through sigma points: as drawn, and as the process moved them."""
 

@@ -17,9 +17,9 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
-from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.beliefs import Gaussian, normal
+from viz_estim.core.measurement import Measurement, gain, symmetrised, transposed
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick
 from viz_estim.core.spaces import Euclidean, Product, Space
@@ -71,7 +71,7 @@ def moments(sigma: SigmaPoints) -> tuple[Array, Array, Array]:
     """Mean (*, n), covariance (*, d, d) and error vectors (*, N, d) of sigma points (Kraft 2003)."""
     mean = sigma.space.mean(sigma.points, sigma.mean_weights)
     errors = sigma.space.minus(sigma.points, mean[..., None, :])
-    return mean, _transposed(errors) @ (sigma.cov_weights[:, None] * errors), errors
+    return mean, transposed(errors) @ (sigma.cov_weights[:, None] * errors), errors
 
 
 @names_its_failures
@@ -85,7 +85,7 @@ def predict(
     drawn = draw(belief.space, belief.mean, belief.cov + noise, rule)
     propagated = SigmaPoints(belief.space, move(drawn.points), drawn.mean_weights, drawn.cov_weights)
     mean, cov, _ = moments(propagated)
-    return UnscentedPredict(name, Gaussian(belief.space, mean, _symmetrised(cov)), drawn, propagated)
+    return UnscentedPredict(name, Gaussian(belief.space, mean, symmetrised(cov)), drawn, propagated)
 
 
 @names_its_failures
@@ -104,61 +104,7 @@ def predict_augmented(
     moved = move(drawn.points[..., :n], drawn.points[..., n:])
     propagated = SigmaPoints(belief.space, moved, drawn.mean_weights, drawn.cov_weights)
     mean, cov, _ = moments(propagated)
-    return UnscentedPredict(name, Gaussian(belief.space, mean, _symmetrised(cov)), drawn, propagated)
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """How a sensor reads a state: its measurement's space, z = measure(x) ⊞ v with v ~ N(0, noise).
-
-    gate: the probability with which a good reading passes (None: all pass). blind(mean): the unit direction (d,) of
-    the state that the sensor cannot see, if there is one.
-    """
-
-    space: Space
-    measure: Callable[[Array], Array]
-    noise: Array
-    gate: float | None = None
-    blind: Callable[[Array], Array] | None = None
-
-
-class Measurement:
-    """Sensors read at one moment and taken in as one vector; each keeps its name, gate and block of S."""
-
-    def __init__(self, sensors: dict[str, Sensor]) -> None:
-        self.sensors = sensors
-        self.space = Product(**{name: sensor.space for name, sensor in sensors.items()})
-        self.noise = np.zeros((len(self.space.axes),) * 2)
-        for name, sensor in sensors.items():
-            self.noise[self.block(name)] = sensor.noise
-        self.part = np.repeat(np.arange(len(sensors)), [len(s.space.axes) for s in sensors.values()])
-        self.gates = {k: chi2.ppf(s.gate, len(s.space.axes)) for k, s in sensors.items() if s.gate is not None}
-
-    def block(self, name: str) -> tuple[slice, slice]:
-        """The sensor's block of a matrix over the measurement's directions."""
-        return self.space.axes_at[name], self.space.axes_at[name]
-
-    def measure(self, x: Array) -> Array:
-        """The expected reading of all sensors, (*, n)."""
-        return np.concatenate([sensor.measure(x) for sensor in self.sensors.values()], axis=-1)
-
-    def passes(self, residual: Array, cov: Array) -> np.ndarray:
-        """Which sensors' residuals pass their gates, (*, s): νᵀS⁻¹ν ≤ χ²(gate), each by its own block of S."""
-        used = np.ones((*residual.shape[:-1], len(self.sensors)), bool)
-        for i, name in enumerate(self.sensors):
-            if name in self.gates:
-                part, (rows, cols) = residual[..., self.space.axes_at[name]], self.block(name)
-                whitened = np.linalg.solve(cov[..., rows, cols], part[..., None])[..., 0]
-                used[..., i] = (part * whitened).sum(-1) <= self.gates[name]
-        return used
-
-    def blind(self, mean: Array, d: int) -> Array:
-        """Each sensor's blind direction (*, d, s), zero where it has none."""
-        directions = np.zeros((*mean.shape[:-1], d, len(self.sensors)))
-        for i, sensor in enumerate(self.sensors.values()):
-            if sensor.blind is not None:
-                directions[..., i] = sensor.blind(mean)
-        return directions
+    return UnscentedPredict(name, Gaussian(belief.space, mean, symmetrised(cov)), drawn, propagated)
 
 
 @names_its_failures
@@ -187,30 +133,21 @@ def update(
     mapped = SigmaPoints(measurement.space, measurement.measure(sigma.points), sigma.mean_weights, sigma.cov_weights)
     R = measurement.noise if noise is None else noise
     predicted, spread, errors = moments(mapped)
-    S = _symmetrised(spread + R)
+    S = symmetrised(spread + R)
     state_errors: Array = belief.space.minus(sigma.points, belief.mean[..., None, :])
-    C = _transposed(state_errors) @ (sigma.cov_weights[:, None] * errors)
+    C = transposed(state_errors) @ (sigma.cov_weights[:, None] * errors)
     residual = measurement.space.minus(z, predicted)
     used = measurement.passes(residual, S)
-    K = _gain(C, S, used[..., measurement.part])
+    K = gain(C, S, used[..., measurement.part])
     delta = (K @ residual[..., None])[..., 0]
     mean = belief.space.plus(belief.mean, delta)
     A = belief.space.transport(belief.mean, delta)
-    cov = _symmetrised(A @ (belief.cov - K @ S @ _transposed(K)) @ _transposed(A))
+    cov = symmetrised(A @ (belief.cov - K @ S @ transposed(K)) @ transposed(A))
     blind = measurement.blind(belief.mean, cov.shape[-1])
     if offered is None:
         offered = np.ones_like(used)
     innovation = Innovation(measurement.space, z, predicted, residual, S, R, C, used, offered, blind)
     return UnscentedUpdate(name, Gaussian(belief.space, mean, cov), innovation, K, sigma, mapped)
-
-
-def _gain(C: Array, S: Array, used: np.ndarray) -> Array:
-    """C·S⁻¹ over the directions in use (*, m); zero columns for the others."""
-    if not used.all():
-        C = C * used[..., None, :]
-        S = np.where(used[..., None, :] & used[..., :, None], S, np.eye(S.shape[-1]))
-    solved = np.linalg.solve(S, _transposed(C)).astype(float, copy=False)
-    return _transposed(solved)
 
 
 @dataclass(frozen=True)
@@ -249,17 +186,3 @@ class UnscentedFilter:
     def draw_readings(self, x: Array, rng: np.random.Generator) -> dict[str, Array]:
         """Readings of a true state x (*, n) from the filter's own sensors."""
         return {k: normal(s.space, s.measure(x), s.noise, rng) for k, s in self.measurement.sensors.items()}
-
-
-def normal(space: Space, mean: Array, cov: Array, rng: np.random.Generator) -> Array:
-    """A draw (*, n) from N(mean, cov) on the space."""
-    white = rng.standard_normal((*mean.shape[:-1], cov.shape[-1], 1))
-    return space.plus(mean, (np.linalg.cholesky(cov) @ white)[..., 0])
-
-
-def _transposed(a: Array) -> Array:
-    return np.swapaxes(a, -1, -2)
-
-
-def _symmetrised(a: Array) -> Array:
-    return 0.5 * (a + _transposed(a))

@@ -12,6 +12,7 @@ import rerun as rr
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario
+from viz_estim.core.scenery import Box
 from viz_estim.core.spaces import S2, SO3, Euclidean
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
@@ -32,7 +33,7 @@ class Scenes:
         self._paths: dict[str, dict[str, Any]] = {}  # by stage: the geometry it draws, as path and archetype
         self._last: tuple[str, ...] = ()  # the stages whose geometry the last step drew
         body = scenario.scenery.get("body")
-        self._body = np.array(body.sizes if body else _DEFAULT_BODY) / 2
+        self._body = np.array(body.sizes if isinstance(body, Box) else _DEFAULT_BODY) / 2
         if any(isinstance(part, SO3) for part in layout.space.parts.values()):
             send_static(stream, schema.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
             self._sphere(f"{schema.WORLD}/sphere", 1.0)

@@ -14,11 +14,13 @@ import numpy as np
 
 from viz_estim.core import quaternions
 from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.measurement import Measurement, Sensor
 from viz_estim.core.quaternions import Array
-from viz_estim.core.run import Box, Scenario, StandIn, Tick
+from viz_estim.core.run import Scenario, StandIn, Tick
+from viz_estim.core.scenery import Box
 from viz_estim.core.spaces import S2, SO3, Euclidean, Product
 from viz_estim.core.stages import Predict, Stage
-from viz_estim.core.unscented import Measurement, Sensor, UnscentedFilter, symmetric
+from viz_estim.core.unscented import UnscentedFilter, symmetric
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import imu_files, imu_simulation
 from viz_estim.scenarios.imu_data import ImuData, prepare
