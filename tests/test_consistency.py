@@ -58,7 +58,9 @@ def test_metrics_name_each_error_with_its_unit_and_measure_it() -> None:
         found = metrics(space, mean, truth)
         assert list(found) == names
         assert list(found.values()) == pytest.approx([*want, 0.2, 3 / np.sqrt(2), 0.1], abs=1e-6)
-    assert list(metrics(SE2(), truth[:, :3], truth[:, :3])) == ["position_rmse_m", "heading_rmse_rad"]
+    assert list(metrics(SE2(), truth[:, :3], truth[:, :3])) == [
+        "position_rmse_m", "final_position_error_m", "heading_rmse_rad"
+    ]  # fmt: skip
 
 
 def test_steps_without_truth_are_left_out_part_by_part() -> None:

@@ -120,7 +120,7 @@ def assert_holds(loaded: Run, steps: list[Step], every: int = 1) -> None:
         tables = loaded.at(step.index)
         assert [table.name for table, _ in tables] == [stage.name for stage in step.stages]
         for stage, (table, at) in zip(step.stages, tables, strict=True):
-            held: dict[str, Any] = {"mean": stage.belief.mean, "cov": stage.belief.cov}
+            held: dict[str, Any] = {name: getattr(stage.belief, name) for name in stage.belief.shapes}
             for field in dataclasses.fields(stage)[2:]:
                 value = getattr(stage, field.name)
                 if isinstance(value, SigmaPoints):
@@ -133,8 +133,7 @@ def assert_holds(loaded: Run, steps: list[Step], every: int = 1) -> None:
             assert set(held) == set(table.values)
             assert [key for key, value in held.items() if not same(table.values[key][at], value)] == []
         if step.stages:
-            assert same(loaded.mean[row], step.stages[-1].belief.mean)
-            assert same(loaded.cov[row], step.stages[-1].belief.cov)
+            assert all(same(values[row], getattr(step.stages[-1].belief, k)) for k, values in loaded.ends.items())
 
 
 @every_scenario
@@ -144,7 +143,7 @@ def test_every_number_comes_back_bit_for_bit(recorded: tuple[Path, list[Step]]) 
     assert_holds(loaded, steps)
     assert loaded.complete
     assert same(loaded.dt, [step.tick.dt for step in steps])
-    missing = np.full(len(loaded.space.names), np.nan)
+    missing = np.full(loaded.truth.shape[1], np.nan)
     assert same(loaded.truth, [missing if step.truth is None else step.truth for step in steps])
     for name, values in loaded.inputs.items():
         kind, _, sensor = name.partition(".")
@@ -201,14 +200,20 @@ def assert_geometry(path: Path, steps: list[Step], every: int = 1) -> None:
     """At each moment of each timeline a viewer shows (by an entity's latest row) what that moment's stages drew."""
     rows: dict[tuple[str, str], dict[int, bool]] = defaultdict(dict)
     for entity, times, lengths in rows_of(path):
-        if entity.startswith(("/sensors/", "/world/")) and entity.split("/")[2] not in ("estimate", "truth"):
+        still = entity.split("/")[2:3] in (["estimate"], ["truth"], ["scenery"])
+        if entity.startswith(("/sensors/", "/world/", "/attitude/")) and not still:
             for timeline, value in times.items():
                 assert value not in rows[entity, timeline], f"{entity}: rows at {timeline} {value} hide each other"
                 rows[entity, timeline][value] = any(lengths)
     moments: dict[str, list[tuple[int, set[str]]]] = {"step": [], "time": [], "stage": []}
-    place = 0
+    place, before, drew = 0, None, False
     for step in steps:
-        shown = [owned(stage) if step.index % every == 0 else set() for stage in step.stages] or [set()]
+        kept = step.index % every == 0
+        shown = []
+        for stage in step.stages:
+            shown.append(owned(stage, before, drew) if kept else set())
+            before, drew = stage, kept
+        shown = shown or [set()]
         moments["step"].append((step.index, set().union(*shown)))
         moments["time"].append((round(step.tick.time * 1e9), set().union(*shown)))
         moments["stage"] += [(place + i, paths) for i, paths in enumerate(shown)]
@@ -222,23 +227,41 @@ def assert_geometry(path: Path, steps: list[Step], every: int = 1) -> None:
             assert visible == (entity in paths), f"{entity} at {timeline} {value}"
 
 
-def owned(stage: Stage) -> set[str]:
-    """The geometry that a stage draws: points of attitudes in the world, points and readings of sensors in theirs."""
-    paths = set()
+def leaves(space: Any) -> Iterator[tuple[str, Any]]:
+    for name, part in space.parts.items():
+        yield from leaves(part) if isinstance(part, Product) else [(name, part)]
+
+
+def owned(stage: Stage, before: Stage | None, drew: bool) -> set[str]:
+    """The geometry that stands during a stage: sigma points of places and attitudes, readings of sensors in scenes of
+    their own, and where the state has a place, what the update moved there. Points that are the stage before's own
+    stand on from there."""
+    paths: set[str] = set()
+    parts = getattr(stage.belief, "space", Product()).parts
+    places = {k for k, part in parts.items() if part.names in (("x", "y"), ("x", "y", "z")) and part.units[0] == "m"}
     for field in dataclasses.fields(stage)[2:]:
         value = getattr(stage, field.name)
-        parts = value.space.parts if isinstance(value, SigmaPoints | Innovation) else {}
         if isinstance(value, Innovation):
-            seen = [sensor for sensor, part in parts.items() if len(part.names) == 3]
-            paths |= {
-                f"/sensors/{sensor}/{stage.name}/{arrow}" for sensor in seen for arrow in ("measured", "predicted")
-            }
-        elif any(isinstance(part, SO3) for part in parts.values()):
-            paths.add(f"/world/{stage.name}/{field.name}")
-        else:
-            paths |= {
-                f"/sensors/{sensor}/{stage.name}/{field.name}" for sensor, part in parts.items() if len(part.names) == 3
-            }
+            for sensor, part in value.space.parts.items():
+                reads = next(iter(getattr(part, "parts", {sensor: part}).values()))
+                if places and part.units[0] == "m" and (reads.names in (("x", "y"), ("x", "y", "z")) or before):
+                    paths.add(f"/world/{stage.name}/{sensor}")  # a place, or ranges to landmarks
+                elif len(part.names) == 3 and reads.units[0] != "m":
+                    paths |= {f"/sensors/{sensor}/{stage.name}/{arrow}" for arrow in ("measured", "predicted")}
+            if places and before:
+                paths |= {f"/world/{stage.name}/before", f"/world/{stage.name}/moved"}
+        elif isinstance(value, SigmaPoints):
+            shared = (
+                [f.name for f in dataclasses.fields(before)[2:] if getattr(before, f.name) is value] if before else []
+            )
+            owner, called = (before, shared[0]) if shared and drew else (stage, field.name)
+            of_state = {name for name, _ in leaves(value.space)} >= parts.keys()
+            for name, part in leaves(value.space):
+                if name in places or (isinstance(part, SO3) and name in parts):
+                    scene = "world" if name in places else "attitude"
+                    paths.add(f"/{scene}/{owner.name}/{called}")
+                elif not of_state and len(part.names) == 3 and part.units[0] != "m":
+                    paths.add(f"/sensors/{name}/{owner.name}/{called}")
     return paths
 
 

@@ -1,5 +1,6 @@
 """A real headless viewer: what it opens, where its cursor stands, what it draws, where it listens, how it ends."""
 
+import io
 import os
 import signal
 import struct
@@ -15,6 +16,7 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 import rerun as rr
 import rerun.blueprint as rrb
+from PIL import Image
 
 from viz_estim.recording.viewer import Viewer, ViewerError, open_files, snapshot
 
@@ -78,6 +80,17 @@ def assert_one_line(error: pytest.ExceptionInfo[ViewerError], *words: str) -> No
         assert word in text
 
 
+def share_that_differs(one: bytes, other: bytes) -> float:
+    """The share of pixels that differ visibly."""
+    a, b = (np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), dtype=int) for png in (one, other))
+    return float((np.abs(a - b).max(-1) > 24).mean())
+
+
+def assert_same_picture(one: bytes, other: bytes) -> None:
+    # The renderer may smooth an edge or place a label differently from frame to frame.
+    assert share_that_differs(one, other) < 0.0005
+
+
 def gone(process: psutil.Process) -> bool:
     """An orphan that nobody has waited for yet counts as gone."""
     try:
@@ -94,8 +107,8 @@ def processes_of(viewer: Viewer) -> list[psutil.Process]:
 @pytest.mark.parametrize(("timeline", "one", "other"), [("step", 20, 120), ("time", 2.0, 12.0), ("stage", 41, 241)])
 def test_a_moment_has_one_picture(picture: Picture, timeline: str, one: float, other: float) -> None:
     first, second, again = picture(timeline, one), picture(timeline, other), picture(timeline, one)
-    assert first == again
-    assert first != second
+    assert_same_picture(first, again)
+    assert share_that_differs(first, second) > 0.001
 
 
 def test_none_is_the_end(viewer: Viewer, picture: Picture, tmp_path: Path) -> None:
@@ -103,7 +116,7 @@ def test_none_is_the_end(viewer: Viewer, picture: Picture, tmp_path: Path) -> No
     viewer.seek("step", 3)
     viewer.seek("step")
     viewer.snapshot(tmp_path / "end.png")
-    assert (tmp_path / "end.png").read_bytes() == at_the_end
+    assert_same_picture((tmp_path / "end.png").read_bytes(), at_the_end)
 
 
 def test_picture_has_the_asked_size_and_leaves_nothing_beside_it(viewer: Viewer, tmp_path: Path) -> None:

@@ -94,10 +94,12 @@ def _parser() -> argparse.ArgumentParser:
     _moment(p).add_argument("--stage", type=int, metavar="N", help="place on the stage timeline")
     p.add_argument("--size", type=_size, default=(1600, 1000), metavar="WxH")
     p.add_argument("-o", "--out", type=Path, required=True, metavar="PNG")
-    p = command("calibrate", _calibrate, "fit sensor constants to ground truth")
-    p.add_argument("system", choices=["imu"], metavar="imu")
+    p = command("calibrate", _calibrate, "fit sensor constants or noise covariances to ground truth")
+    p.add_argument("system", choices=["imu", "diffdrive"], metavar="imu|diffdrive")
     p.add_argument("--data", type=Path, action="append", required=True, metavar="PATH")
-    p.add_argument("--out", type=Path, metavar="FILE.json", help="the constants; its picture goes beside it, as .rrd")
+    p.add_argument(
+        "--out", type=Path, metavar="FILE.json", help="what was found; a picture of it, if any, goes beside it, as .rrd"
+    )
     _json(p)
     p = command("export", _export, "a recording for other tools")
     p.add_argument("file", type=Path, metavar="FILE")
@@ -224,21 +226,22 @@ def _asked(arguments: argparse.Namespace) -> tuple[str, float | None]:
 
 def _calibrate(arguments: argparse.Namespace) -> None:
     from viz_estim.recording import calibration_picture
-    from viz_estim.scenarios import imu_files, imu_fit
+    from viz_estim.scenarios import SYSTEMS
 
     out: Path | None = arguments.out
     if out:
         check_writable(out, suffix=".json")
         check_writable(out.with_suffix(".rrd"))
-    logs = [imu_files.load(*one) for one in imu_files.find_sets(arguments.data)]
-    fitted = imu_fit.fit(logs)
+    fitted = SYSTEMS[arguments.system].calibrate(arguments.data)
     result = fitted.to_json()
     if out:
-        picture = out.with_suffix(".rrd")
-        calibration_picture.write(picture, fitted.pictures(), result)
+        made = {"calibration": str(out)}
+        if pictures := fitted.pictures():
+            made["recording"] = str(out.with_suffix(".rrd"))
+            calibration_picture.write(out.with_suffix(".rrd"), pictures, result)
         with whole(out) as aside:
             aside.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-        result |= {"calibration": str(out), "recording": str(picture)}
+        result |= made
     _print(result, printing.calibration_text, arguments.json)
 
 

@@ -22,6 +22,8 @@ def export(run: Run, kind: str, out: Path) -> list[Path]:
     """Writes the run as `kind` and returns the files written; each appears whole or not at all."""
     if kind == "tum":
         files = {out: run.mean, out.with_name(f"{out.stem}.truth{out.suffix}"): run.truth}
+        if run.labels:
+            raise BadInput(f"{run.path}: a belief over labels has no trajectory; use --to csv")
         return [_write_tum(path, run, states) for path, states in files.items() if np.isfinite(states).any()]
     if kind == "csv":
         names, columns = zip(*_series(run).items(), strict=True)
@@ -54,6 +56,9 @@ def _write_tum(path: Path, run: Run, states: Array) -> Path:
 def _series(run: Run) -> dict[str, Array]:
     """One row a step: the estimate, its σ, the truth, the error, NEES, and each sensor's residual and NIS."""
     columns: dict[str, Array] = {"step": run.step.astype(float), "time_s": run.time, "dt_s": run.dt}
+    if run.labels:
+        columns |= {f"p.{name}": np.exp(run.ends["log_probabilities"][:, i]) for i, name in enumerate(run.labels)}
+        return columns | {"truth": run.truth[:, 0]} | _inputs(run)
     columns |= {name: run.mean[:, i] for i, name in enumerate(run.space.names)}
     sigma = np.sqrt(np.maximum(np.diagonal(run.cov, axis1=1, axis2=2), 0))
     columns |= {f"sigma.{name}": sigma[:, i] for i, name in enumerate(run.space.axes)}
@@ -62,8 +67,7 @@ def _series(run: Run) -> dict[str, Array]:
         error = run.space.minus(run.mean, run.truth)
         columns |= {f"error.{name}": error[:, i] for i, name in enumerate(run.space.axes)}
         columns["nees"] = nees(run.space, run.mean, run.cov, run.truth)[0]
-    for name, values in run.inputs.items():
-        columns |= {f"{name}.{i}": values[:, i] for i in range(values.shape[1])}
+    columns |= _inputs(run)
     for table in run.stages.values():
         if "innovation.residual" in table.values:
             space = table.spaces["innovation"]
@@ -77,6 +81,10 @@ def _series(run: Run) -> dict[str, Array]:
     return columns
 
 
+def _inputs(run: Run) -> dict[str, Array]:
+    return {f"{name}.{i}": values[:, i] for name, values in run.inputs.items() for i in range(values.shape[1])}
+
+
 def _spread(at: np.ndarray, values: Array, count: int) -> Array:
     out = np.full(count, np.nan)
     inside = at < count
@@ -85,7 +93,7 @@ def _spread(at: np.ndarray, values: Array, count: int) -> Array:
 
 
 def _everything(run: Run) -> dict[str, Any]:
-    arrays: dict[str, Any] = {"step": run.step, "time": run.time, "dt": run.dt, "mean": run.mean, "cov": run.cov}
+    arrays: dict[str, Any] = {"step": run.step, "time": run.time, "dt": run.dt, **run.ends}
     arrays |= {"truth": run.truth, "names": np.array(run.space.names), "axes": np.array(run.space.axes)}
     arrays |= {f"inputs/{name}": values for name, values in run.inputs.items()}
     for table in run.stages.values():

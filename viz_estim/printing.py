@@ -11,7 +11,9 @@ import numpy as np
 from viz_estim.parameters import kind_text, parameters
 
 if TYPE_CHECKING:
+    from viz_estim.core.spaces import Space
     from viz_estim.recording.reader import Run
+    from viz_estim.recording.tables import StageTable
     from viz_estim.running import Source
 
 
@@ -105,7 +107,7 @@ def overview(run: Run) -> dict[str, Any]:
         "last_step": int(run.step[-1]),
         "duration_s": float(run.time[-1] - run.time[0]),
         "stages": {name: len(table.step) for name, table in run.stages.items()},
-        "state": dict(zip(run.space.names, run.space.units, strict=True)),
+        "state": dict(zip(run.space.names, run.space.units, strict=True)) or dict.fromkeys(run.labels, ""),
         "inputs": list(run.inputs),
         "error": run.error if run.complete is False else (facts["result"] or {}).get("error"),
         **run.summary(),
@@ -131,11 +133,11 @@ def step(run: Run, row: int) -> dict[str, Any]:
     number = int(run.step[row])
     stages = []
     for table, at in run.at(number):
-        numbers = {name: values[at] for name, values in table.values.items() if name not in ("mean", "cov")}
+        numbers = {name: values[at] for name, values in table.values.items() if name not in run.ends}
         stages.append(
-            {"name": table.name, "stage": int(table.place[at])}
-            | {"belief": {"mean": table.mean[at], "cov": table.cov[at]}}
+            {"name": table.name, "stage": int(table.place[at]), "belief": _belief(run, table, at)}
             | {name: value for name, value in numbers.items() if not np.isnan(value).all()}
+            | _moved(run, table, at)
         )
     result = run.properties.get("result") or {}
     error = result.get("error") if number == run.step[-1] else None
@@ -151,6 +153,26 @@ def step(run: Run, row: int) -> dict[str, Any]:
     }
 
 
+def _belief(run: Run, table: StageTable, at: int) -> dict[str, Any]:
+    if run.labels:
+        p = np.exp(table.values["log_probabilities"][at])
+        return {"probabilities": dict(zip(run.labels, p, strict=True))}
+    return {"mean": table.mean[at], "cov": table.cov[at]}
+
+
+def _moved(run: Run, table: StageTable, at: int) -> dict[str, Any]:
+    """What each component of an update's reading moved: K[:, j]·ν_j by name, largest first in σ of the state before."""
+    before = run.before(table, at)
+    if before is None or "gain" not in table.values or "innovation" not in table.spaces:
+        return {}
+    sigma = np.sqrt(np.maximum(np.diagonal(before[0].cov[before[1]]), np.finfo(float).tiny))
+    moved = table.values["gain"][at] * table.values["innovation.residual"][at]
+    in_sigma = moved / sigma[:, None]
+    order = np.argsort(-np.abs(in_sigma).max(0))
+    names = table.spaces["innovation"].axes
+    return {"moved": {names[j]: {"by": moved[:, j], "sigmas": in_sigma[:, j]} for j in order.tolist()}}
+
+
 def step_text(run: Run, value: dict[str, Any]) -> str:
     lines = [f"step {value['step']} at {value['time']:.4f} s (dt {value['dt']:.4f} s)"]
     lines += [f"  {name:18} {_row(numbers)}" for name, numbers in value["inputs"].items()]
@@ -158,13 +180,21 @@ def step_text(run: Run, value: dict[str, Any]) -> str:
         lines.append(f"  {'truth':18} {_row(value['truth'])}")
     for stage in value["stages"]:
         lines.append(f"{stage['name']}  (stage {stage['stage']})")
-        mean, cov = stage["belief"]["mean"], stage["belief"]["cov"]
-        lines.append(f"  {'mean':18} {_named(run.space.names, mean, run.space.units)}")
-        sigma = np.sqrt(np.maximum(np.diagonal(cov), 0))
-        lines.append(f"  {'σ':18} {_named(run.space.axes, sigma, run.space.axis_units)}")
+        if run.labels:
+            p = stage["belief"]["probabilities"]
+            lines.append(f"  {'probability':18} {_named(run.labels, p.values(), ('',) * len(p))}")
+        else:
+            mean, cov = stage["belief"]["mean"], stage["belief"]["cov"]
+            lines.append(f"  {'mean':18} {_named(run.space.names, mean, run.space.units)}")
+            sigma = np.sqrt(np.maximum(np.diagonal(cov), 0))
+            lines.append(f"  {'σ':18} {_named(run.space.axes, sigma, run.space.axis_units)}")
         table = run.stages[stage["name"]]
         for name, numbers in stage.items():
             if name in ("name", "stage", "belief"):
+                continue
+            if name == "moved":
+                for reading, one in numbers.items():
+                    lines.append(f"  {f'moved by {reading}':18} {_moves(run.space, one)}")
                 continue
             space = table.spaces.get(name.partition(".")[0])
             if name.endswith((".residual", ".z", ".predicted")) and space is not None:
@@ -180,7 +210,24 @@ def step_text(run: Run, value: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _moves(space: Space, one: dict[str, Any]) -> str:
+    """The directions that a reading moved, those it moved most (in σ) first."""
+    order = np.argsort(-np.abs(one["sigmas"]))[:4]
+    units = space.axis_units
+    cells = [f"{space.axes[i]} {one['by'][i]:+.3g} {units[i]}".rstrip() + f" ({one['sigmas'][i]:+.2g}σ)" for i in order]
+    return "  ".join(cells)
+
+
 def calibration_text(value: dict[str, Any]) -> str:
+    lines, scenario = (_constants(value), "imu-ukf") if value["system"] == "imu" else (_noises(value), "diffdrive-ekf")
+    if "calibration" in value:
+        lines.append(f"viz-estim run {scenario} --data PATH --calibration {value['calibration']}")
+    if "recording" in value:
+        lines.append(f"viz-estim open {value['recording']}")
+    return "\n".join(lines)
+
+
+def _constants(value: dict[str, Any]) -> list[str]:
     lines = []
     for sensor, unit, shown in (("accel", "mps2", "m/s²"), ("gyro", "radps", "rad/s")):
         fitted = value[sensor]
@@ -197,12 +244,22 @@ def calibration_text(value: dict[str, Any]) -> str:
             f"{1e3 * one['time_offset_se']:.1f} ms late; {one['windows']} windows, {one['frozen']} frozen samples "
             "left out"
         )
-    if "calibration" in value:
-        lines += [
-            f"viz-estim run imu-ukf --data PATH --calibration {value['calibration']}",
-            f"viz-estim open {value['recording']}",
-        ]
-    return "\n".join(lines)
+    return lines
+
+
+def _noises(value: dict[str, Any]) -> list[str]:
+    lines = []
+    for noise, symbol, names in (
+        ("input", "V", ("speed [m/s]", "turn rate [rad/s]")),
+        ("gps", "W", ("x [m]", "y [m]")),
+    ):
+        lines.append(f"{symbol}, covariance of the {noise} noise, from {value[f'{noise}_count']} samples:")
+        lines.append(f"  {'':18}" + "".join(f"{name:>20}" for name in (*names, "mean")))
+        for i, name in enumerate(names):
+            numbers = [*zip(value[f"{noise}_cov"][i], value[f"{noise}_cov_se"][i], strict=True)]
+            numbers.append((value[f"{noise}_mean"][i], value[f"{noise}_mean_se"][i]))
+            lines.append(f"  {name:18}" + "".join(f"{f'{v:.4f} ± {e:.4f}':>20}" for v, e in numbers))
+    return lines
 
 
 def _named(names: tuple[str, ...], values: Any, units: tuple[str, ...]) -> str:

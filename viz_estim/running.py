@@ -184,10 +184,10 @@ def _data_function(module: Any, scenario: Callable[..., Any], name: str) -> Call
 
 def recorded(steps: Iterator[Step], scenario: Scenario, recorder: Recorder, progress: Progress) -> dict[str, Any]:
     """Runs the steps into the recorder; the result as `run --json` has it."""
-    tally = Tally(scenario.space, max(scenario.beliefs))
+    tally = Tally(scenario.space, max(scenario.beliefs), scenario.facts)
     estimate = record = 0.0
     count = stages = 0
-    error = None
+    error = ended = None
     while True:
         began = time.perf_counter()
         step = next(steps, None)
@@ -199,9 +199,11 @@ def recorded(steps: Iterator[Step], scenario: Scenario, recorder: Recorder, prog
         tally.add(step)
         record += time.perf_counter() - estimated
         count, stages = count + 1, stages + len(step.stages)
-        error = step.error
+        error, ended = step.error, step
         progress(count, len(scenario.ticks))
     last = scenario.ticks[max(count - 1, 0)].time
+    if scenario.figures and ended and not error:
+        tally.facts = {**tally.facts, **scenario.figures(ended)}
     result = {
         "steps": count,
         "stages": stages,
@@ -210,7 +212,7 @@ def recorded(steps: Iterator[Step], scenario: Scenario, recorder: Recorder, prog
         **tally.summary(),
     }
     began = time.perf_counter()
-    recorder.close(result)
+    recorder.close(result, facts=tally.facts)
     record += time.perf_counter() - began
     return result | {"wall_s": {"estimate": estimate, "record": record}}
 

@@ -5,6 +5,7 @@ Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and Na
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from viz_estim.core import quaternions
+from viz_estim.core.discrete import categorical_metrics
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, SO3, Product, Space, wrap
 
@@ -69,9 +71,13 @@ def _errors(name: str, part: Space, x: Array, y: Array) -> dict[str, float]:
         return _attitude(x, y)
     if isinstance(part, SE2):
         turn = wrap(x[:, 2:] - y[:, 2:])
-        return {"position_rmse_m": rms(x[:, :2] - y[:, :2]), "heading_rmse_rad": rms(turn)}
+        place = x[:, :2] - y[:, :2]
+        final = {"final_position_error_m": rms(place[-1:])}
+        return {"position_rmse_m": rms(place), **final, "heading_rmse_rad": rms(turn)}
     unit = _UNIT_NAMES.get(part.axis_units[0], part.axis_units[0])
-    return {f"{name}_rmse_{unit}" if unit else f"{name}_rmse": rms(part.minus(x, y))}
+    error = part.minus(x, y)
+    found = {f"{name}_rmse_{unit}" if unit else f"{name}_rmse": rms(error)}
+    return found | ({"final_position_error_m": rms(error[-1:])} if name == "position" and unit == "m" else {})
 
 
 def _attitude(x: Array, y: Array) -> dict[str, float]:
@@ -143,34 +149,65 @@ def nees_summary(values: Array, dof: int) -> dict[str, float] | None:
     return {"mean": float(known.mean()), "dof": dof, "inside": float(((known >= low) & (known <= high)).mean())}
 
 
+def nees_by_part(space: Space, mean: Array, cov: Array, truth: Array) -> dict[str, float]:
+    """The mean NEES of each part of the state by its own block of the covariance, as `nees_<part>`: which part carries
+    an inconsistency. Nothing where only one part has a truth."""
+    parts = space if isinstance(space, Product) else Product(state=space)
+    found = {}
+    for name, part in parts.parts.items():
+        at, axes = parts.at[name], parts.axes_at[name]
+        one = nees_summary(*nees(part, mean[:, at], cov[:, axes, axes], truth[:, at]))
+        if one:
+            found[f"nees_{name}"] = one["mean"]
+    return found if len(found) > 1 else {}
+
+
 def summary(
-    space: Space, mean: Array, cov: Array, truth: Array, innovations: list[tuple[Product, Array, Array, np.ndarray]]
+    space: Space | None,
+    ends: Mapping[str, Array],
+    truth: Array,
+    innovations: list[tuple[Product, Array, Array, np.ndarray]],
+    facts: Mapping[str, float],
 ) -> dict[str, Any]:
     """`metrics`, `nis` by sensor, and `nees` of a run, as the command line prints them.
 
-    mean, truth (T, n) and cov (T, d, d) at the end of each step that counts; innovations: of each update stage its
-    measurement's space, residuals (M, m), S (M, m, m) and which were offered (M, s).
+    ends: the belief's arrays at the end of each step that counts, mean (T, n) and cov (T, d, d) or log_probabilities
+    (T, K); truth (T, n) or (T, 1). innovations: of each update stage its measurement's space, residuals (M, m), S
+    (M, m, m) and which were offered (M, s). facts: figures known beforehand, printed among the metrics.
     """
-    if not len(mean):
-        return {"metrics": {}, "nis": {}, "nees": None}
-    by_sensor = {name: found.summary() for rows in innovations for name, found in nis(*rows).items()}
-    return {
-        "metrics": metrics(space, mean, truth),
-        "nis": {name: values for name, values in by_sensor.items() if values},
-        "nees": nees_summary(*nees(space, mean, cov, truth)),
-    }
+    by_sensor: dict[str, Any] = {}
+    for name, values in _pooled([nis(*rows) for rows in innovations]).items():
+        if found := values.summary():
+            by_sensor[name] = found
+    plain = {"metrics": dict(facts), "nis": by_sensor, "nees": None}
+    if not len(truth):
+        return plain
+    if "log_probabilities" in ends:
+        return plain | {"metrics": categorical_metrics(ends["log_probabilities"], truth) | dict(facts)}
+    assert space is not None
+    mean, cov = ends["mean"], ends["cov"]
+    figures = metrics(space, mean, truth) | nees_by_part(space, mean, cov, truth) | dict(facts)
+    return plain | {"metrics": figures, "nees": nees_summary(*nees(space, mean, cov, truth))}
+
+
+def _pooled(found: list[dict[str, Nis]]) -> dict[str, Nis]:
+    """By sensor: the readings of its several targets (`range/1`, `range/2`) are one sensor's."""
+    pooled: dict[str, list[Nis]] = {}
+    for one in found:
+        for name, values in one.items():
+            pooled.setdefault(name.partition("/")[0], []).append(values)
+    return {name: Nis(np.concatenate([n.values for n in all_]), all_[0].dof) for name, all_ in pooled.items()}
 
 
 class Tally:
     """Gathers of each step what a run's summary needs, and nothing large: clouds and sigma points are let go.
 
-    first: the first step that counts.
+    first: the step from which on steps count.
     """
 
-    def __init__(self, space: Space, first: int) -> None:
-        self.space, self.first = space, first
-        self.means: list[Array] = []
-        self.covs: list[Array] = []
+    def __init__(self, space: Space | None, first: int = 0, facts: Mapping[str, float] | None = None) -> None:
+        self.space, self.first, self.facts = space, first, facts or {}
+        self.ends: dict[str, list[Array]] = {}
         self.truths: list[Array] = []
         self.innovations: dict[str, list[Any]] = {}
 
@@ -179,9 +216,11 @@ class Tally:
         if step.index < self.first or not step.stages or step.error:
             return
         belief = step.stages[-1].belief
-        self.means.append(belief.mean)
-        self.covs.append(belief.cov)
-        self.truths.append(np.full(len(belief.mean), np.nan) if step.truth is None else step.truth)
+        names = ("log_probabilities",) if self.space is None else ("mean", "cov")
+        for name in names:
+            self.ends.setdefault(name, []).append(getattr(belief, name))
+        size = 1 if self.space is None else len(self.space.names)
+        self.truths.append(np.full(size, np.nan) if step.truth is None else step.truth)
         for stage in step.stages:
             if hasattr(stage, "innovation"):
                 self.innovations.setdefault(stage.name, []).append(stage.innovation)
@@ -192,5 +231,6 @@ class Tally:
             (rows[0].space, *(np.stack([getattr(row, k) for row in rows]) for k in ("residual", "cov", "offered")))
             for rows in self.innovations.values()
         ]
-        mean, cov, truth = (np.stack(rows) if rows else np.empty(0) for rows in (self.means, self.covs, self.truths))
-        return summary(self.space, mean, cov, truth, innovations)
+        ends = {name: np.stack(rows) for name, rows in self.ends.items()}
+        truth = np.stack(self.truths) if self.truths else np.empty(0)
+        return summary(self.space, ends, truth, innovations, self.facts)

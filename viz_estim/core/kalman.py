@@ -118,7 +118,7 @@ def linear(F: Array, Q: Array, sensors: Mapping[str, Sensor], B: Array | None = 
 
     def process(x: Array, tick: Tick) -> Array:
         moved = (F @ x[..., None])[..., 0]
-        return moved if B is None or tick.control is None else moved + B @ tick.control
+        return moved if B is None or tick.control is None else moved + (B @ tick.control[..., None])[..., 0]
 
     return KalmanFilter(process, lambda x, tick: F, lambda x, tick: Q, sensors)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -74,8 +74,10 @@ class Scenario:
     """An estimator over data.
 
     beliefs: by step, the belief that is set there; step 0 must have one. The steps before the last one count in no
-    metric. truth (T, n), NaN where it is absent, or None. scenery: what else stands in the scene, by name. notes: what
-    to look at, as markdown. facts: figures known beforehand, printed among the metrics; names carry their units.
+    metric. truth (T, n), or of labels their index (T, 1), NaN where it is absent; or None. scenery: what else stands in
+    the scene, by name. notes: what to look at, as markdown. facts: figures known beforehand, printed among the metrics;
+    names carry their units. until: the run ends after the first step of which it is true. figures: of a run that ended
+    with this step, printed among the metrics too.
     """
 
     estimator: Estimator
@@ -85,10 +87,13 @@ class Scenario:
     scenery: Mapping[str, Scenery] = field(default_factory=dict)
     notes: str = ""
     facts: Mapping[str, float] = field(default_factory=dict)
+    until: Callable[[Step], bool] | None = None
+    figures: Callable[[Step], dict[str, float]] | None = None
 
     @property
     def space(self) -> Any:
-        return self.beliefs[0].space
+        """The space of the belief; None where it is over labels."""
+        return getattr(self.beliefs[0], "space", None)
 
 
 class Chance:
@@ -107,9 +112,11 @@ class Chance:
 
 
 def run(scenario: Scenario, seed: int = 0) -> Iterator[Step]:
-    """The scenario's steps, one a tick; the last one carries a failure where the estimator raised one."""
+    """The scenario's steps, one a tick, or fewer: the last one carries a failure where the estimator raised one."""
     belief: Belief | None = None
     chance = Chance(seed)
+    # A person's own kind of belief may lack them: then its first stage says so.
+    shapes: Mapping[str, tuple[int, ...]] = getattr(scenario.beliefs[0], "shapes", {})
     for k, tick in enumerate(scenario.ticks):
         stages: list[Stage] = []
         error = None
@@ -119,28 +126,27 @@ def run(scenario: Scenario, seed: int = 0) -> Iterator[Step]:
         assert belief is not None, "a scenario sets a belief at step 0"
         try:
             for stage in scenario.estimator.step(belief, tick, chance.at(k)):
-                _check_shapes(stage, scenario.space)
+                _check_shapes(stage, shapes)
                 stages.append(stage)
                 belief = stage.belief
-                if not (np.isfinite(belief.mean).all() and np.isfinite(belief.cov).all()):
+                if not all(np.isfinite(getattr(belief, name)).all() for name in shapes):
                     raise NotFinite("the belief is no longer finite")
         except Exception as failure:  # whatever a person's filter raises is what they came to see
             text = f"{type(failure).__name__}: {failure}"
             error = Failure(k, _failing_stage(stages, failure), text)
         truth = None if scenario.truth is None else scenario.truth[k]
-        yield Step(k, tick, tuple(stages), truth, error)
-        if error:
+        step = Step(k, tick, tuple(stages), truth, error)
+        yield step
+        if error or (scenario.until and scenario.until(step)):
             return
 
 
-def _check_shapes(stage: Any, space: Any) -> None:
-    """TypeError or ValueError where a person's filter yields what is no stage over the scenario's space."""
+def _check_shapes(stage: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """TypeError or ValueError where a person's filter yields what is no stage, or a belief of another kind."""
     if not isinstance(stage, Stage):
         raise TypeError(f"step() must yield stages, got {type(stage).__name__}")
-    n, d = len(space.names), len(space.axes)
-    belief: Any = stage.belief
-    for name, shape in (("mean", (n,)), ("cov", (d, d))):
-        value = getattr(belief, name, None)
+    for name, shape in shapes.items():
+        value = getattr(stage.belief, name, None)
         if not isinstance(value, np.ndarray) or value.shape != shape:
             got = value.shape if isinstance(value, np.ndarray) else type(value).__name__
             raise ValueError(f"stage {stage.name}: expected a {name} of shape {shape}, got {got}")

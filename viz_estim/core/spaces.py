@@ -281,10 +281,11 @@ class Product:
         return np.concatenate([part.mean(points[..., s], weights) for part, s in self._slices()], axis=-1)
 
     def transport(self, x: Array, delta: Array) -> Array:
-        A = np.zeros((*delta.shape, delta.shape[-1]))
+        A = _identity(delta).copy()
         for name, part in self.parts.items():
-            at = self.axes_at[name]
-            A[..., at, at] = part.transport(x[..., self.at[name]], delta[..., at])
+            if not part.flat:
+                at = self.axes_at[name]
+                A[..., at, at] = part.transport(x[..., self.at[name]], delta[..., at])
         return A
 
     def _slices(self) -> list[tuple[Space, slice]]:

@@ -87,6 +87,13 @@ class UnscentedPredict(Predict):
 
 
 @dataclass(frozen=True, slots=True)
+class DiscretePredict(Predict):
+    """A prediction over labels: p'ⱼ = Σᵢ pᵢ·Tᵢⱼ; transition T (K, K), each row sums to one."""
+
+    transition: Array
+
+
+@dataclass(frozen=True, slots=True)
 class Update(Stage):
     """A measurement taken in: Δ = gain·residual moved the mean; gain (*, d, m) is zero where a sensor was gated."""
 
@@ -100,6 +107,80 @@ class UnscentedUpdate(Update):
 
     sigma: SigmaPoints
     mapped: SigmaPoints
+
+
+@dataclass(frozen=True, slots=True)
+class DiscreteUpdate(Stage):
+    """Readings of s binary sensors taken in over K labels: log p'ⱼ = log pⱼ + Σᵢ log_likelihoodsᵢⱼ + constant.
+
+    reading (*, s): 1 where a sensor said yes; offered (*, s): False where it gave no reading at this tick, and its row
+    of log_likelihoods (*, s, K) is zero. A row says how its sensor moved which label: only differences within it count.
+    """
+
+    sensors: tuple[str, ...]
+    reading: Array
+    offered: NDArray[np.bool_]
+    log_likelihoods: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """K pairs of points, one of a moved cloud and the nearest one of a fixed cloud; K differs from step to step.
+
+    source (K, d) the moved points, target (K, d) their partners, distance (K,) between the two, all in m in the fixed
+    cloud's frame; source_index, target_index (K,) their rows in the clouds.
+    """
+
+    source: Array
+    target: Array
+    distance: Array
+    source_index: NDArray[np.intp]
+    target_index: NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True)
+class Match(Stage):
+    """The points of a moved cloud paired with those of a fixed one; the belief stays as it was."""
+
+    matches: Matches
+
+
+@dataclass(frozen=True, slots=True)
+class Align(Stage):
+    """The pose that fits the matches of the stage before best.
+
+    rmse (m) over these `count` matches after the fit; converged: at the new pose the matches are the same again, so
+    that nothing would change any more.
+    """
+
+    rmse: float
+    count: int
+    converged: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Weigh(Stage):
+    """Particles weighed by what was read: log_likelihoods (*, N) of the readings z, as log p(z | x).
+
+    evidence (*,): log Σ w·p(z | x), with the weights from before, how well the cloud foresaw the readings. ess (*,):
+    the effective sample size that is left.
+    """
+
+    log_likelihoods: Array
+    evidence: Array
+    ess: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Resample(Stage):
+    """Particles drawn anew by their weights: particle i is a copy of ancestors[i] (*, N) of the stage before.
+
+    distinct (*,): how many different ancestors there are; ess (*,): the effective sample size before.
+    """
+
+    ancestors: NDArray[np.int_]
+    distinct: Array
+    ess: Array
 
 
 P = ParamSpec("P")

@@ -11,15 +11,15 @@ covariance, K (*, d, m) gain.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cache
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from viz_estim.core.beliefs import Gaussian, normal
-from viz_estim.core.measurement import Measurement, gain, symmetrised, transposed
+from viz_estim.core.measurement import Measurement, Sensor, gain, symmetrised, transposed
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick
 from viz_estim.core.spaces import Euclidean, Product, Space
@@ -88,6 +88,12 @@ def predict(
     return UnscentedPredict(name, Gaussian(belief.space, mean, symmetrised(cov)), drawn, propagated)
 
 
+@lru_cache(maxsize=16)
+def _with_noise(space: Space, q: int) -> Product:
+    """The space of a state and the q numbers of its noise."""
+    return Product(state=space, noise=Euclidean([f"w{i}" for i in range(q)]))
+
+
 @names_its_failures
 def predict_augmented(
     belief: Gaussian, move: Callable[[Array, Array], Array], noise: Array, rule: Rule, *, name: str = "predict"
@@ -97,10 +103,11 @@ def predict_augmented(
     The rule is for d + q dimensions, noise Q (q, q); move maps states (*, N, n) and noises (*, N, q) to states.
     """
     d, q, n = belief.cov.shape[-1], noise.shape[-1], belief.mean.shape[-1]
-    space = Product(state=belief.space, noise=Euclidean([f"w{i}" for i in range(q)]))
     joint = np.zeros((*belief.cov.shape[:-2], d + q, d + q))
     joint[..., :d, :d], joint[..., d:, d:] = belief.cov, noise
-    drawn = draw(space, np.concatenate([belief.mean, np.zeros((*belief.mean.shape[:-1], q))], axis=-1), joint, rule)
+    mean = np.concatenate([belief.mean, np.zeros((*belief.mean.shape[:-1], q))], axis=-1)
+    space: Any = belief.space  # a protocol does not say that it can be hashed
+    drawn = draw(_with_noise(space, q), mean, joint, rule)
     moved = move(drawn.points[..., :n], drawn.points[..., n:])
     propagated = SigmaPoints(belief.space, moved, drawn.mean_weights, drawn.cov_weights)
     mean, cov, _ = moments(propagated)
@@ -117,6 +124,7 @@ def update(
     sigma: SigmaPoints | None = None,
     noise: Array | None = None,
     offered: np.ndarray | None = None,
+    measure: Callable[[Array], Array] | None = None,
     name: str = "update",
 ) -> UnscentedUpdate:
     """The belief after a reading z (*, n): K = C·S⁻¹, mean ⊞ K·ν, P − K·S·Kᵀ (Kraft 2003).
@@ -125,12 +133,13 @@ def update(
     vectors q_i·q̄⁻¹ are in that frame, ours in the body's, and the transport makes both the same filter.
 
     sigma: the prediction's own propagated points, which Kraft's filter maps into the measurement; without them, points
-    are drawn from the belief. noise: R in place of the measurement's own. A gated sensor moves nothing: its columns of
-    K are zero.
+    are drawn from the belief. noise: R in place of the measurement's own; measure: the expected reading in place of its
+    own, where that depends on the moment. A gated sensor moves nothing: its columns of K are zero.
     """
     if sigma is None:
         sigma = draw(belief.space, belief.mean, belief.cov, rule)
-    mapped = SigmaPoints(measurement.space, measurement.measure(sigma.points), sigma.mean_weights, sigma.cov_weights)
+    expected = (measure or measurement.measure)(sigma.points)
+    mapped = SigmaPoints(measurement.space, expected, sigma.mean_weights, sigma.cov_weights)
     R = measurement.noise if noise is None else noise
     predicted, spread, errors = moments(mapped)
     S = symmetrised(spread + R)
@@ -186,3 +195,47 @@ class UnscentedFilter:
     def draw_readings(self, x: Array, rng: np.random.Generator) -> dict[str, Array]:
         """Readings of a true state x (*, n) from the filter's own sensors."""
         return {k: normal(s.space, s.measure(x), s.noise, rng) for k, s in self.measurement.sensors.items()}
+
+
+@dataclass(frozen=True)
+class AugmentedFilter:
+    """An estimator: one prediction a step with its noise among the points, then an update by each sensor in turn.
+
+    process(points, noises, tick) moves states, process_noise(tick) is the noises' Q (q, q) over tick.dt; rule gives the
+    points of any dimension. Sensors are read at their own rates: those that the tick has a reading of. expected[name],
+    a function of states and tick, stands in for the `measure` of a sensor into whose reading the tick's control enters.
+    The first update takes the prediction's points, a further one draws anew. The stage of a filter's only sensor is
+    `update`, those of several are `update/NAME`.
+    """
+
+    process: Callable[[Array, Array, Tick], Array]
+    process_noise: Callable[[Tick], Array]
+    sensors: Mapping[str, Sensor]
+    rule: Callable[[int], Rule]
+    expected: Mapping[str, Callable[[Array, Tick], Array]] = field(default_factory=dict)
+    _measurements: dict[str, Measurement] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        each = {name: Measurement({name: sensor}) for name, sensor in self.sensors.items()}
+        object.__setattr__(self, "_measurements", each)
+
+    def step(self, belief: Gaussian, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
+        sigma, d = None, belief.cov.shape[-1]
+        if tick.dt > 0:
+            Q = self.process_noise(tick)
+            rule = self.rule(d + Q.shape[-1])
+            predicted = predict_augmented(belief, lambda x, w: self.process(x, w, tick), Q, rule)
+            yield predicted
+            belief, sigma = predicted.belief, predicted.propagated
+        for name, measurement in self._measurements.items():
+            if name in tick.measurements:
+                title = "update" if len(self.sensors) == 1 else f"update/{name}"
+                z, measure = tick.measurements[name], self._measure(name, tick)
+                updated = update(belief, z, measurement, self.rule(d), sigma=sigma, measure=measure, name=title)
+                yield updated
+                belief, sigma = updated.belief, None
+
+    def _measure(self, name: str, tick: Tick) -> Callable[[Array], Array] | None:
+        """The reading expected at this tick, where it depends on it."""
+        expected = self.expected.get(name)
+        return None if expected is None else lambda x: expected(x, tick)

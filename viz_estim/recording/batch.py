@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from viz_estim.core.beliefs import Belief
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Step
 from viz_estim.core.stages import Stage
@@ -15,20 +16,23 @@ from viz_estim.recording.columns import Times
 
 
 class StageRows:
-    """All rows of one stage in a batch: its records, their times, their steps' rows, and which ended their step."""
+    """All rows of one stage in a batch: its records, their times, their steps' rows, which ended their step, and the
+    stage before each (None at the run's first)."""
 
-    def __init__(self, name: str, stages: list[Stage], at: Times, rows: np.ndarray, last: np.ndarray) -> None:
-        self.name, self.stages, self.at, self.rows, self.last = name, stages, at, rows, last
+    def __init__(
+        self, name: str, stages: list[Stage], at: Times, rows: np.ndarray, last: np.ndarray, before: list[Stage | None]
+    ) -> None:
+        self.name, self.stages, self.at, self.rows, self.last, self.before = name, stages, at, rows, last, before
         self._gathered: dict[str, Any] = {}
 
+    def objects(self, path: str) -> list[Any]:
+        """A quantity of each record by its attribute path, such as `innovation.residual`."""
+        return list(map(attrgetter(path), self.stages))
+
     def values(self, path: str) -> Array | list[Array]:
-        """A quantity by its attribute path, such as `innovation.residual`: (M, …), or a list where shapes differ."""
+        """The same as one array (M, …), or as a list where shapes differ."""
         if path not in self._gathered:
-            found = list(map(attrgetter(path), self.stages))
-            try:
-                self._gathered[path] = np.array(found, dtype=float)
-            except ValueError:
-                self._gathered[path] = found
+            self._gathered[path] = _stacked(self.objects(path))
         gathered: Array | list[Array] = self._gathered[path]
         return gathered
 
@@ -36,14 +40,37 @@ class StageRows:
         """The same, of a quantity that has one shape in all rows."""
         return np.asarray(self.values(path))
 
+    def prior(self, path: str) -> Array:
+        """A quantity of the belief before the stage, such as `cov` (M, …); for rows that have one (`has_prior`)."""
+        key = f"prior.{path}"
+        if key not in self._gathered:
+            read = attrgetter(f"belief.{path}")
+            self._gathered[key] = _stacked([read(stage) for stage in self.before if stage is not None])
+        return np.asarray(self._gathered[key])
+
+    @cached_property
+    def has_prior(self) -> np.ndarray:
+        """Which rows had a stage before them."""
+        return np.array([stage is not None for stage in self.before])
+
+    def shared(self, field: str, earlier: str) -> np.ndarray:
+        """Which rows hold in a field the very object that the stage before holds in its field `earlier`."""
+        return np.array(
+            [
+                getattr(before, earlier, None) is mine
+                for mine, before in zip(self.objects(field), self.before, strict=True)
+            ]
+        )
+
 
 class Batch:
     """Steps, with `times` of their first stages, `names` of their stages, and `stages` as rows by name.
 
-    first: the place on the stage timeline of the first step; `end` is the next batch's.
+    first: the place on the stage timeline of the first step; `end` is the next batch's. before: the stage that ended
+    the step before.
     """
 
-    def __init__(self, steps: list[Step], first: int) -> None:
+    def __init__(self, steps: list[Step], first: int, before: Stage | None = None) -> None:
         self.steps = steps
         self.names = [tuple([stage.name for stage in step.stages]) for step in steps]
         # A step without any stage (it failed at once) still takes a place on the stage timeline.
@@ -53,6 +80,11 @@ class Batch:
         self.times = Times(
             np.array([step.index for step in steps]), np.array([step.tick.time for step in steps]), places[:-1]
         )
+        self._ended: list[Stage | None] = []  # by step, the stage that ended the step before
+        for step in steps:
+            self._ended.append(before)
+            before = step.stages[-1] if step.stages else before
+        self.last = before
         alike: dict[tuple[str, ...], list[int]] = {}
         for row, names in enumerate(self.names):
             alike.setdefault(names, []).append(row)
@@ -70,9 +102,36 @@ class Batch:
         if len(groups) > 1:
             order = np.argsort(places)
             rows, offsets, last, places = rows[order], offsets[order], last[order], places[order]
-        steps = self.steps
-        stages = [steps[row].stages[i] for row, i in zip(rows.tolist(), offsets.tolist(), strict=True)]
-        return StageRows(name, stages, Times(self.times.step[rows], self.times.time[rows], places), rows, last)
+        steps, ended = self.steps, self._ended
+        pairs = list(zip(rows.tolist(), offsets.tolist(), strict=True))
+        stages = [steps[row].stages[i] for row, i in pairs]
+        before = [steps[row].stages[i - 1] if i else ended[row] for row, i in pairs]
+        return StageRows(name, stages, Times(self.times.step[rows], self.times.time[rows], places), rows, last, before)
+
+    @cached_property
+    def _order(self) -> np.ndarray:
+        return np.argsort(np.concatenate([rows.at.stage for rows in self.stages]))
+
+    @cached_property
+    def at(self) -> Times:
+        """The times of all stages, in order."""
+        columns = [np.concatenate([getattr(rows.at, name) for rows in self.stages]) for name in _TIMELINES]
+        return Times(*(column[self._order] for column in columns))
+
+    @cached_property
+    def ends(self) -> np.ndarray:
+        """Which of all stages, in order, ended their step."""
+        return np.flatnonzero(np.concatenate([rows.last for rows in self.stages])[self._order])
+
+    @cached_property
+    def end_rows(self) -> np.ndarray:
+        """The steps' rows of these."""
+        return np.concatenate([rows.rows for rows in self.stages])[self._order][self.ends]
+
+    def beliefs(self, path: str) -> Array:
+        """A quantity of the belief after each of all stages, in order, such as `mean` (M, n)."""
+        parts = [rows.array(f"belief.{path}") for rows in self.stages]
+        return (parts[0] if len(parts) == 1 else np.concatenate(parts))[self._order]
 
     @cached_property
     def truth(self) -> Array:
@@ -80,3 +139,18 @@ class Batch:
         size = next((len(step.truth) for step in self.steps if step.truth is not None), 0)
         nothing = np.full(size, np.nan)
         return np.array([nothing if step.truth is None else step.truth for step in self.steps])
+
+
+_TIMELINES = ("step", "time", "stage")
+
+
+def _stacked(found: list[Any]) -> Any:
+    try:
+        return np.array(found, dtype=float)
+    except ValueError:
+        return found
+
+
+def belief_fields(belief: Belief) -> list[str]:
+    """The arrays that a belief is made of, such as mean and cov."""
+    return list(belief.shapes)

@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import rerun.blueprint as rrb
 
 from viz_estim.core.consistency import band
-from viz_estim.core.spaces import S2, SO3, Euclidean, Space
+from viz_estim.core.spaces import SO3, Space
 from viz_estim.recording import schema
 from viz_estim.recording.layout import Layout
+from viz_estim.recording.scenes import own_scene
 
 _Item = rrb.Container | rrb.View
+_BACKGROUND = [13, 14, 16]
+_MANY = 5  # rows of plots that one tab holds
 
 
 def build(layout: Layout) -> rrb.Blueprint:
     """Scenes at the left, plots in tabs at the right, lanes and notes below."""
     scenes = _scenes(layout)
-    plots = rrb.Tabs(_health(layout), _state(layout), name="plots", active_tab=0)
+    tabs = [_probabilities()] if layout.labels else [*_health(layout), _state(layout), *_moved(layout)]
+    plots = rrb.Tabs(*tabs, name="plots", active_tab=0)
     lanes = rrb.StateTimelineView(origin=schema.LANES, name="Lanes: stage, and what became of each sensor's reading")
     notes = rrb.TextDocumentView(origin=schema.NOTES, name="What to look at")
     left: list[_Item] = [*scenes, notes]
-    shares = [3, 2, 1.6] if len(scenes) == 2 else [3, 1]
+    shares: list[float] = {1: [1.0], 2: [3.0, 1.0], 3: [3.0, 2.0, 1.6]}[len(left)]
+    low = min(0.4, 0.054 + 0.044 * (len(layout.inputs) + 1 + bool(layout.labels)))  # a lane is some 37 pixels high
     whole = rrb.Horizontal(
-        rrb.Vertical(*left, row_shares=shares[: len(left)] if scenes else None),
-        rrb.Vertical(plots, lanes, row_shares=[4, 1]),
-        column_shares=[2, 3],
+        rrb.Vertical(*left, row_shares=shares),
+        rrb.Vertical(plots, lanes, row_shares=[1 - low, low]),
+        column_shares=[2, 3] if scenes else [1, 3],
     )
     return rrb.Blueprint(
         whole,
@@ -34,60 +41,99 @@ def build(layout: Layout) -> rrb.Blueprint:
 
 
 def _scenes(layout: Layout) -> list[_Item]:
-    scenes: list[_Item] = []
+    """At most two panels: places in the world, or the bars of a belief over labels; attitudes and sensors below."""
+    points = any("points" in what for fields in layout.stages.values() for what in fields.values())
+    truth = ", truth white" if layout.true_parts else ""
+    first: list[_Item] = []
+    if layout.labels:
+        middle = 0.5 * schema.BAR * (len(layout.labels) - 1)
+        eye = rrb.EyeControls3D(
+            position=[middle, 0.45, 1.3 + 0.35 * len(layout.labels)], look_target=[middle, 0.45, 0],
+            eye_up=[0, 1, 0], kind="Orbital",
+        )  # fmt: skip
+        name = "Belief: the probability of each label at this moment"
+        first.append(rrb.Spatial3DView(
+            origin=schema.BARS, name=name, eye_controls=eye, line_grid=False, background=_BACKGROUND
+        ))  # fmt: skip
+    if layout.position:
+        kind = "Plan from above" if layout.planar else "World"
+        first.append(_world(layout, f"{kind} [m]: estimate amber with 3σ{truth}, before the update grey"))
+    second: list[_Item] = []
     if any(isinstance(part, SO3) for part in layout.space.parts.values()):
-        points = any("points" in what for fields in layout.stages.values() for what in fields.values())
-        title = f"World: estimate amber{', truth white' if layout.true_parts else ''}"
-        scenes.append(_scene(schema.WORLD, f"{title}{', sigma points on the sphere' if points else ''}", 1.0))
-    sensors = [
-        (name, space)
-        for name, space in layout.sensors.items()
-        if len(space.names) == 3 and isinstance(space, (Euclidean, S2))
-    ]
-    views: list[_Item] = []
-    for name, space in sensors:
-        colour, _ = schema.sensor_colour(layout.place(name))
-        title = f"{name}, body axes{_unit(space, 0, space.units)}: measured {colour}, predicted amber"
-        views.append(_scene(schema.sensor(name), title, layout.reach[name]))
-    if views:
-        scenes.append(rrb.Tabs(*views, active_tab=0) if len(views) > 1 else views[0])
-    return scenes
+        title = f"Attitude: estimate amber{truth}{', sigma points on the sphere' if points else ''}"
+        (second if layout.position else first).append(_scene(schema.ATTITUDE, title, 1.0))
+    for name, space in layout.sensors.items():
+        if own_scene(layout, name):
+            colour, _ = schema.sensor_colour(layout.place(name))
+            title = f"{name}, body axes{_unit(space, 0, space.units)}: measured {colour}, predicted amber"
+            second.append(_scene(schema.sensor(name), title, layout.reach[name]))
+    if second:
+        first.append(rrb.Tabs(*second, active_tab=0) if len(second) > 1 else second[0])
+    return first
+
+
+def _world(layout: Layout, name: str) -> rrb.Spatial3DView:
+    """The world, whole at first; a plan is seen from above. The estimate's trail reaches back to the start."""
+    assert layout.extent
+    (x, y, z), reach = layout.extent
+    if layout.planar:
+        eye = rrb.EyeControls3D(position=[x, y, 2.9 * reach], look_target=[x, y, 0], eye_up=[0, 1, 0], kind="Orbital")
+    else:
+        place = [x + 1.7 * reach, y - 2.0 * reach, z + 1.3 * reach]
+        eye = rrb.EyeControls3D(position=place, look_target=[x, y, z], eye_up=[0, 0, 1], kind="Orbital")
+    start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    since = [rrb.VisibleTimeRange(timeline, start=start, end=now) for timeline in ("step", "time", "stage")]
+    return rrb.Spatial3DView(
+        origin=schema.WORLD,
+        name=name,
+        eye_controls=eye,
+        line_grid=rrb.LineGrid3D(visible=True, spacing=_round(reach / 4), color=(45, 46, 50)),
+        background=_BACKGROUND,
+        overrides={f"{schema.WORLD}/estimate/trail": [rrb.VisibleTimeRanges(since)]},
+    )
 
 
 def _scene(origin: str, name: str, size: float) -> rrb.Spatial3DView:
     eye = rrb.EyeControls3D(
         position=[1.6 * size, -1.9 * size, 1.1 * size], look_target=[0, 0, 0], eye_up=[0, 0, 1], kind="Orbital"
     )
-    return rrb.Spatial3DView(origin=origin, name=name, eye_controls=eye, line_grid=False, background=[13, 14, 16])
+    return rrb.Spatial3DView(origin=origin, name=name, eye_controls=eye, line_grid=False, background=_BACKGROUND)
 
 
-def _health(layout: Layout) -> rrb.Container:
-    """Is the filter right, and does it know: errors, innovations, NIS."""
-    rows: list[_Item] = []
-    if layout.true_parts:
-        for name, part in layout.space.parts.items():
-            if name in layout.true_parts:
-                views = [
-                    _plot("error", f"{name}.{axis}", f"{name} error {axis}{_unit(part, i)} ±3σ")
-                    for i, axis in enumerate(part.axes)
-                ]
-                rows.append(rrb.Horizontal(*views))
-    for name, space in layout.sensors.items():
-        views = [
-            _plot("innovation", f"{name}.{axis}", f"{name} innov. {axis}{_unit(space, i)} ±3σ")
-            for i, axis in enumerate(space.axes)
-        ]
-        rows.append(rrb.Horizontal(*views))
+def _probabilities() -> rrb.Container:
+    axis = rrb.ScalarAxis(range=(0.0, 1.0))
+    return rrb.Vertical(_plot("probability", "labels", "Probability of each label", axis, legend=True), name="Belief")
+
+
+def _health(layout: Layout) -> list[_Item]:
+    """Is the filter right, and does it know: errors, innovations, NIS; in two tabs where one would be crowded."""
+    errors: list[_Item] = []
+    for name, part in layout.space.parts.items():
+        if name in layout.true_parts:
+            views = [
+                _plot("error", f"{name}.{axis}", f"{_titled(name, axis)} error{_unit(part, i)} ±3σ")
+                for i, axis in enumerate(part.axes)
+            ]
+            errors += _rows(views)
+    views = [
+        _plot("innovation", f"{name}.{axis}", f"{_titled(name, axis)} innov.{_unit(space, i)} ±3σ")
+        for name, space in layout.sensors.items()
+        for i, axis in enumerate(space.axes)
+    ]
+    widths = [len(space.axes) for space in layout.sensors.values()]
+    innovations = _rows(views, widths)
     if layout.sensors:
-        views = []
+        bands = []
         for name, space in layout.sensors.items():
             dof = len(space.axes)
             axis = rrb.ScalarAxis(range=(0.0, 3 * band(dof)[1]))
-            views.append(_plot("nis", name, f"NIS {name}: {dof} expected, 95 % between the lines", axis))
-        rows.append(rrb.Horizontal(*views))
-    if not rows:
-        rows = _sigmas(layout)
-    return rrb.Vertical(*rows, name="Consistency")
+            title = f"NIS {name}: {dof} expected, 95 % between the lines" if len(layout.sensors) < 3 else f"NIS {name}"
+            bands.append(_plot("nis", name, title, axis))
+        innovations += _rows(bands)
+    if len(errors) + len(innovations) > _MANY and errors and innovations:
+        return [rrb.Vertical(*innovations, name="Innovations"), rrb.Vertical(*errors, name="Errors")]
+    rows = [*errors, *innovations] or _sigmas(layout)
+    return [rrb.Vertical(*rows, name="Consistency")]
 
 
 def _state(layout: Layout) -> rrb.Container:
@@ -95,19 +141,47 @@ def _state(layout: Layout) -> rrb.Container:
     rows: list[_Item] = []
     for name, part in layout.space.parts.items():
         views = [
-            _plot("state", f"{name}.{component}", f"{name} {component}{_unit(part, i, part.units)}", legend=i == 0)
+            _plot(
+                "state", f"{name}.{component}", f"{_titled(name, component)}{_unit(part, i, part.units)}", legend=i == 0
+            )
             for i, component in enumerate(part.names)
         ]
-        rows += [rrb.Horizontal(*views[i : i + 4]) for i in range(0, len(views), 4)]
-    rows.append(rrb.Horizontal(*_sigmas(layout)))
+        rows += _rows(views)
+    rows += _rows(_sigmas(layout))
     return rrb.Vertical(*rows, name="State")
 
 
+def _moved(layout: Layout) -> list[_Item]:
+    """Which reading moved which direction of the state, in σ of the state before."""
+    if not any("gain" in fields for fields in layout.stages.values()):
+        return []
+    rows: list[_Item] = []
+    for name, part in layout.space.parts.items():
+        views = [
+            _plot("moved", f"{name}.{axis}", f"K·ν on {_titled(name, axis)} [σ before]", legend=not rows and i == 0)
+            for i, axis in enumerate(part.axes)
+        ]
+        rows += _rows(views)
+    return [rrb.Vertical(*rows, name="What moved it")]
+
+
+def _rows(views: Sequence[_Item], widths: list[int] | None = None) -> list[_Item]:
+    """The views in rows of at most four; those that belong together (`widths` of them) stay in one row."""
+    groups: list[list[_Item]] = []
+    start = 0
+    for width in widths or [len(views)]:
+        group = list(views[start : start + width])
+        start += width
+        if groups and len(groups[-1]) + width <= 4 and width < 3:
+            groups[-1] += group
+        else:
+            across = 3 if width % 3 == 0 else 4
+            groups += [group[i : i + across] for i in range(0, width, across)]
+    return [rrb.Horizontal(*group) for group in groups]
+
+
 def _sigmas(layout: Layout) -> list[_Item]:
-    return [
-        _plot("sigma", name, f"{name} σ = √ of the covariance's diagonal{_unit(part)}", legend=True)
-        for name, part in layout.space.parts.items()
-    ]
+    return [_plot("sigma", name, f"{name} σ{_unit(part)}", legend=True) for name, part in layout.space.parts.items()]
 
 
 def _plot(
@@ -122,6 +196,17 @@ def _plot(
     )
 
 
+def _titled(name: str, axis: str) -> str:
+    """`accel x`, but `range/1` or `heading` alone where the axis adds nothing."""
+    return name if axis in (name.partition("/")[0], "angle") else f"{name} {axis}"
+
+
 def _unit(space: Space, i: int = 0, units: tuple[str, ...] | None = None) -> str:
     unit = (units or space.axis_units)[i]
     return f" [{'deg' if unit == 'rad' else unit}]" if unit else ""
+
+
+def _round(length: float) -> float:
+    """A round number near a length, for a grid."""
+    power = 10.0 ** int(f"{length:e}".partition("e")[2])
+    return power * min((1.0, 2.0, 5.0, 10.0), key=lambda nice: abs(nice - length / power))

@@ -75,6 +75,14 @@ def numbers(archetype: str, component: str, rows: Array | Sequence[Array | None]
     return rr.ComponentColumn(_named(archetype, component), _Batch(pa.array(flat)), offsets=counts)
 
 
+def once(archetype: str, component: str, value: Array, rows: int) -> rr.ComponentColumn:
+    """One value that all rows share, kept in the first of them alone: the reader fills the others in."""
+    flat = np.asarray(value, float).ravel()
+    counts = np.zeros(rows, int)
+    counts[0] = len(flat)
+    return rr.ComponentColumn(_named(archetype, component), _Batch(pa.array(flat)), offsets=_offsets(counts, rows))
+
+
 @cache
 def _kind(archetype: Any, component: str) -> tuple[rr.ComponentDescriptor, pa.DataType]:
     """A component's descriptor and arrow type, learnt from a column that Rerun makes of one value."""

@@ -1,4 +1,5 @@
-"""What a recording holds, learnt from the steps themselves: stages, their fields' spaces, sensors, what was drawn.
+"""What a recording holds, learnt from the scenario and the steps themselves: the belief's kind, stages, their fields'
+spaces, sensors, where the scene is.
 
 The view is a function of this, and the reader gives arrays their shapes by it.
 """
@@ -6,51 +7,84 @@ The view is a function of this, and the reader gives arrays their shapes by it.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from viz_estim.core.descriptions import describe
 from viz_estim.core.quaternions import Array
-from viz_estim.core.spaces import Product, Space
-from viz_estim.core.stages import Innovation, SigmaPoints, Stage
-from viz_estim.recording.batch import Batch
+from viz_estim.core.run import Scenario
+from viz_estim.core.scenery import Landmarks, Path
+from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product, Space
+from viz_estim.core.stages import Innovation, SigmaPoints
+from viz_estim.recording.batch import Batch, StageRows
 
 
 class Layout:
-    """stages: per stage the shape (as JSON: a list) or the space of each field; inputs: the sensors seen on ticks.
+    """space: the state's, as a product (of nothing, where the belief is over labels); inputs: the sensors on ticks.
 
-    sensors: the spaces of those that innovations came from, reach: about how long their readings are; true_parts: the
-    parts of the state that have a truth.
+    stages: per stage the shape (as JSON: a list) or the space of each field; sensors: the spaces of those that
+    innovations came from; reach: about how long their readings are; silent: by sensor the steps at which a reading was
+    due and none came; true_parts: the parts of the state that have a truth; gapless: those of them that have it at
+    every step. position, heading, attitude: the parts that say where and how the body is, if any.
     """
 
-    def __init__(self, space: Space, truth: Array | None) -> None:
-        self.space = as_product(space)
-        known = np.isfinite(np.empty((0, len(self.space.names))) if truth is None else truth)
-        self.true_parts = [name for name, at in self.space.at.items() if known[:, at].all(1).any()]
+    def __init__(self, scenario: Scenario) -> None:
+        self.labels: tuple[str, ...] = getattr(scenario.beliefs[0], "labels", ())
+        self.space = as_product(scenario.space)
+        truth = np.empty((0, len(self.space.names))) if scenario.truth is None or self.labels else scenario.truth
+        known = {name: np.isfinite(truth[:, at]).all(1) for name, at in self.space.at.items()}
+        self.true_parts = [name for name, rows in known.items() if rows.any()]
+        self.gapless = {name for name in self.true_parts if known[name].all()}
+        parts = self.space.parts.items()
+        self.position = next((name for name, part in parts if is_position(part) or isinstance(part, SE2)), None)
+        self.heading = next((name for name, part in parts if isinstance(part, (SO2, SE2))), None)
+        self.attitude = next((name for name, part in parts if isinstance(part, SO3)), None)
+        self.scenery = scenario.scenery
+        self.extent = self._extent(scenario, truth) if self.position else None
+        self.silent = _silences(scenario)
         self.stages: dict[str, dict[str, Any]] = {}
         self.inputs: list[str] = []
         self.sensors: dict[str, Space] = {}
         self.reach: dict[str, float] = {}
 
+    @property
+    def planar(self) -> bool:
+        """Whether the position is in the plane."""
+        return self.position is not None and len(place_of(self.space.parts[self.position], np.empty(3))) == 2
+
+    def _extent(self, scenario: Scenario, truth: Array) -> tuple[Array, float]:
+        """The centre (3,) and the half width in m of what is known to be in the scene."""
+        assert self.position
+        part, at = self.space.parts[self.position], self.space.at[self.position]
+        seen = [place_of(part, x[self.space.at[self.position]])[None] for x in (scenario.beliefs[0].mean,)]
+        if self.position in self.true_parts:
+            seen.append(place_of(part, truth[np.isfinite(truth[:, at]).all(1), at]))
+        seen += [thing.positions for thing in scenario.scenery.values() if isinstance(thing, (Landmarks, Path))]
+        points = np.concatenate([flat3(np.asarray(place, float)) for place in seen])
+        low, high = points.min(0), points.max(0)
+        return 0.5 * (low + high), max(0.5, float(0.5 * np.abs(high - low).max()))
+
     def learn(self, batch: Batch) -> bool:
         """Takes in what is new; True where anything is."""
-        before = (len(self.stages), len(self.inputs))
+        new = False
         for rows in batch.stages:
             if rows.name not in self.stages:
-                self._learn(rows.stages[0])
+                self._learn(rows)
+                new = True
+            new |= self._learn_sources(rows)
+        seen: dict[str, None] = dict.fromkeys(self.inputs)
         for step in batch.steps:
-            tick = step.tick
-            for sensor in tick.measurements:
-                if sensor not in self.inputs:
-                    self.inputs.append(sensor)
-            for sensor in tick.raw:
-                if sensor not in self.inputs:
-                    self.inputs.append(sensor)
-        return before != (len(self.stages), len(self.inputs))
+            if step.tick.measurements.keys() - seen.keys() or step.tick.raw.keys() - seen.keys():
+                seen |= dict.fromkeys(step.tick.measurements) | dict.fromkeys(step.tick.raw)
+                new = True
+        self.inputs = list(seen)
+        return new
 
-    def _learn(self, stage: Stage) -> None:
+    def _learn(self, rows: StageRows) -> None:
         fields: dict[str, Any] = {}
+        stage = rows.stages[0]
         for field in dataclasses.fields(stage)[2:]:
             value = getattr(stage, field.name)
             if isinstance(value, SigmaPoints):
@@ -61,9 +95,24 @@ class Layout:
                 for name, at in value.space.at.items():
                     size = float(np.linalg.norm(value.z[at]))
                     self.reach[name] = size if size > 0.1 else 1.0
-            elif isinstance(value, np.ndarray):
-                fields[field.name] = {"shape": list(value.shape)}
-        self.stages[stage.name] = fields
+            elif isinstance(value, (np.ndarray, float, int)):
+                fields[field.name] = {"shape": list(np.shape(value))}
+            elif isinstance(value, tuple) and all(isinstance(one, str) for one in value):
+                fields[field.name] = {"names": list(value)}
+        self.stages[rows.name] = fields
+
+    def _learn_sources(self, rows: StageRows) -> bool:
+        """Finds the points that are those of the stage before (Kraft's filter maps its prediction's own): they are
+        kept once."""
+        new = False
+        last, before = rows.stages[-1], rows.before[-1]
+        for field, what in self.stages[rows.name].items():
+            if before is not None and "points" in what and "same_as" not in what:
+                for earlier, of in self.stages.get(before.name, {}).items():
+                    if "points" in of and getattr(before, earlier) is getattr(last, field):
+                        what["same_as"] = [before.name, earlier]
+                        new = True
+        return new
 
     def place(self, sensor: str) -> int:
         """Where the sensor stands among all: its colour."""
@@ -73,6 +122,48 @@ class Layout:
         return {"stages": self.stages, "inputs": self.inputs}
 
 
-def as_product(space: Space) -> Product:
-    """The space itself, or a product of it alone under the name `state`."""
+def _silences(scenario: Scenario) -> dict[str, set[int]]:
+    """By sensor, the steps before its first reading, and within a gap of more than five times its usual interval."""
+    came: dict[str, list[int]] = {}
+    for k, tick in enumerate(scenario.ticks):
+        for sensor in {**tick.measurements, **tick.raw}:
+            came.setdefault(sensor, []).append(k)
+    silent = {}
+    for sensor, steps in came.items():
+        usual = float(np.median(np.diff(steps))) if len(steps) > 1 else 1.0
+        ends = zip([-1, *steps], [*steps, len(scenario.ticks)], strict=True)
+        gaps = [range(a + 1, b) for a, b in ends if b - a > 5 * usual or a < 0]
+        silent[sensor] = {step for gap in gaps for step in gap}
+    return silent
+
+
+def as_product(space: Space | None) -> Product:
+    """The space itself, or a product of it alone under the name `state`; of nothing where there is none."""
+    if space is None:
+        return Product()
     return space if isinstance(space, Product) else Product(state=space)
+
+
+def leaves(space: Product, start: int = 0) -> Iterator[tuple[str, Space, slice]]:
+    """The parts that are no products themselves, with their names and where they stand in the whole's numbers."""
+    for name, part in space.parts.items():
+        at = space.at[name]
+        if isinstance(part, Product):
+            yield from leaves(part, start + at.start)
+        else:
+            yield name, part, slice(start + at.start, start + at.stop)
+
+
+def is_position(space: Space) -> bool:
+    """Whether it is a place in the plane or in space: x, y and perhaps z, in metres."""
+    return isinstance(space, Euclidean) and space.names in (("x", "y"), ("x", "y", "z")) and set(space.units) == {"m"}
+
+
+def place_of(space: Space, x: Array) -> Array:
+    """The position in a part's values (*, n): all of them, or the first two of a planar pose."""
+    return x[..., :2] if isinstance(space, SE2) else x[..., : len(space.names)]
+
+
+def flat3(points: Array) -> Array:
+    """Points (*, 2) or (*, 3) as (*, 3): the plane is z = 0."""
+    return points if points.shape[-1] == 3 else np.concatenate([points, np.zeros((*points.shape[:-1], 1))], axis=-1)

@@ -21,6 +21,7 @@ from viz_estim.core.spaces import Product, Space
 from viz_estim.errors import BadInput
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.rescue import whole
+from viz_estim.recording.tables import Gathered, StageTable, ends, fill_in, table_of
 
 
 class NotARun(BadInput):
@@ -28,49 +29,36 @@ class NotARun(BadInput):
 
 
 @dataclass(frozen=True)
-class StageTable:
-    """All rows of one stage: step (M,), place (M,) on the stage timeline, and its numbers by name, (M, …).
-
-    `mean` (M, n) and `cov` (M, d, d) are there always; the others are named `field` or `field.part`, such as
-    `gain`, `innovation.residual`, `sigma.points`. A quantity that only some rows have holds NaN in the others.
-    """
-
-    name: str
-    step: np.ndarray
-    place: np.ndarray
-    values: dict[str, Array]
-    spaces: dict[str, Space]
-
-    @property
-    def mean(self) -> Array:
-        return self.values["mean"]
-
-    @property
-    def cov(self) -> Array:
-        return self.values["cov"]
-
-
-@dataclass(frozen=True)
 class Run:
     """A recorded run. step, time (N,) of every step; dt (N,) s; truth (N, n), NaN where there is none.
 
-    inputs: `control`, `z.<sensor>` and `raw.<sensor>` by name (N, …); mean (N, n) and cov (N, d, d) are the belief at
-    the end of each step. properties: scenario, params, seed, data, versions, …; complete: the run ended well.
+    inputs: `control`, `z.<sensor>` and `raw.<sensor>` by name (N, …). ends: the belief at the end of each step, by the
+    name of its arrays: mean (N, n) and cov (N, d, d), or log_probabilities (N, K) of `labels`, whose truth (N, 1) is
+    the label's index; the space then has no parts. properties: scenario, params, seed, data, versions, …; complete:
+    the run ended well.
     """
 
     path: Path
     properties: dict[str, Any]
     space: Space
+    labels: tuple[str, ...]
     step: np.ndarray
     time: Array
     dt: Array
     truth: Array
     inputs: dict[str, Array]
     stages: dict[str, StageTable]
-    mean: Array
-    cov: Array
+    ends: dict[str, Array]
     error: str | None
     complete: bool
+
+    @property
+    def mean(self) -> Array:
+        return self.ends["mean"]
+
+    @property
+    def cov(self) -> Array:
+        return self.ends["cov"]
 
     def at(self, step: int) -> list[tuple[StageTable, int]]:
         """The stages of a step in order, each as its table and row."""
@@ -80,6 +68,15 @@ class Run:
             for row in np.flatnonzero(table.step == step)
         ]
         return [(table, row) for _, table, row in sorted(found, key=lambda entry: entry[0])]
+
+    def before(self, table: StageTable, row: int) -> tuple[StageTable, int] | None:
+        """The stage that came before a stage, as its table and row; None before the first."""
+        place = int(table.place[row]) - 1
+        for other in self.stages.values():
+            found = int(np.searchsorted(other.place, place))
+            if found < len(other.place) and other.place[found] == place:
+                return other, found
+        return None
 
     def row(self, *, step: int | None = None, time: float | None = None) -> int:
         """The row of a step by its number, or of the last one at or before a time (s). BadInput where there is none."""
@@ -103,7 +100,7 @@ class Run:
 
     def summary(self) -> dict[str, Any]:
         """`metrics`, `nis` and `nees`, computed from the recorded numbers."""
-        counts = (self.step >= self.properties.get("first", 0)) & np.isfinite(self.mean).all(1)
+        counts = (self.step >= self.properties.get("first", 0)) & np.isfinite(next(iter(self.ends.values()))).all(1)
         if self.error is not None:
             counts[-1] = False
         last = self.step[counts][-1] if counts.any() else -1
@@ -115,7 +112,9 @@ class Run:
                 assert isinstance(space, Product)
                 residual, cov, offered = (table.values[f"innovation.{k}"][rows] for k in ("residual", "cov", "offered"))
                 innovations.append((space, residual, cov, offered.astype(bool)))
-        return summary(self.space, self.mean[counts], self.cov[counts], self.truth[counts], innovations)
+        facts = self.properties.get("facts", {})
+        ends = {name: values[counts] for name, values in self.ends.items()}
+        return summary(self.space, ends, self.truth[counts], innovations, facts)
 
 
 def load(path: str | Path, *, points: bool = True) -> Run:
@@ -125,8 +124,8 @@ def load(path: str | Path, *, points: bool = True) -> Run:
     """
     path = Path(path)
     properties: dict[str, Any] = {}
-    steps = _Gathered()
-    stages: dict[str, _Gathered] = {}
+    steps = Gathered()
+    stages: dict[str, Gathered] = {}
     error = None
     for chunk in _chunks(path):
         entity = str(chunk.entity_path)
@@ -137,23 +136,26 @@ def load(path: str | Path, *, points: bool = True) -> Run:
         elif entity == "/events":
             error = _texts(chunk.to_record_batch()).get("TextLog:text")
         elif entity.startswith("/stages/"):
-            stages.setdefault(entity.removeprefix("/stages/"), _Gathered(points)).add(chunk.to_record_batch())
-    if "space" not in properties or not steps.times:
+            stages.setdefault(entity.removeprefix("/stages/"), Gathered(points)).add(chunk.to_record_batch())
+    if not properties.keys() & {"space", "labels"} or not steps.times:
         raise NotARun(f"{path}: holds no run of viz_estim (make one with `viz-estim run`)")
     facts = {name: json.loads(text) for name, text in properties.items()}
-    space = rebuild(facts["space"])
+    space = rebuild(facts["space"]) if "space" in facts else as_product(None)
+    labels = tuple(facts.get("labels", ()))
     index = steps.index()
     inputs = {name: steps.column(name, (-1,)) for name in steps.names() if not name.startswith(("dt", "truth"))}
     truth = np.full((len(index["step"]), len(space.names)), np.nan)
     for name, at in as_product(space).at.items():
         truth[:, at] = steps.column(f"truth.{name}", (at.stop - at.start,))
+    if labels:
+        truth = steps.column("truth.label", (1,))
     fields = facts.get("stages", {})
     known = [*(name for name in fields if name in stages), *(name for name in stages if name not in fields)]
-    tables = {name: _table(name, stages[name], space, fields.get(name, {})) for name in known}
-    mean, cov = _ends(index["step"], tables, space)
+    tables = {name: table_of(name, stages[name], space, fields.get(name, {})) for name in known}
+    fill_in(tables, fields)
     return Run(
-        path, facts, space, index["step"], index["time"], steps.column("dt", ()), truth, inputs, tables, mean, cov,
-        error, "result" in facts,
+        path, facts, space, labels, index["step"], index["time"], steps.column("dt", ()), truth, inputs, tables,
+        ends(index["step"], tables, space, labels), error, "result" in facts,
     )  # fmt: skip
 
 
@@ -170,89 +172,6 @@ def _chunks(path: Path) -> Iterator[Any]:
     except (ValueError, OSError, RuntimeError) as error:
         text = " ".join(str(error).split())
         raise BadInput(f"{path}: not a readable recording, or damaged ({text[:120]})") from error
-
-
-class _Gathered:
-    """The rows of one entity, chunk by chunk."""
-
-    def __init__(self, points: bool = True) -> None:
-        self.times: list[dict[str, np.ndarray]] = []
-        self.columns: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {}  # chunk number, lengths, flat values
-        self._points = points
-
-    def add(self, batch: pa.RecordBatch) -> None:
-        if not {"step", "time", "stage"} <= set(batch.schema.names):  # not ours
-            return
-        nanoseconds = batch.column("time").cast(pa.int64()).to_numpy()
-        times = {name: batch.column(name).to_numpy() for name in ("step", "stage")}
-        self.times.append(times | {"time": nanoseconds / 1e9})
-        for name in batch.schema.names:
-            component = name.partition(":")[2]
-            if component and (self._points or not component.endswith(".points")):
-                column = batch.column(name)
-                lengths = column.value_lengths().fill_null(0).to_numpy()
-                entry = (len(self.times) - 1, lengths, column.flatten().to_numpy())
-                self.columns.setdefault(component, []).append(entry)
-
-    def names(self) -> list[str]:
-        return list(self.columns)
-
-    def index(self) -> dict[str, np.ndarray]:
-        return {key: np.concatenate([times[key] for times in self.times]) for key in ("step", "stage", "time")}
-
-    def column(self, name: str, shape: tuple[int, ...]) -> Array:
-        """The values (rows, *shape), NaN where a row has none; a −1 in the shape is found from the longest row."""
-        counts = [len(times["step"]) for times in self.times]
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        pieces = self.columns.get(name, [])
-        if -1 in shape:
-            longest = max((int(lengths.max(initial=0)) for _, lengths, _ in pieces), default=0)
-            known = int(np.prod([v for v in shape if v != -1]))
-            shape = tuple(longest // known if v == -1 else v for v in shape)
-        size = int(np.prod(shape))
-        out = np.full((int(starts[-1]), size), np.nan)
-        for chunk, lengths, flat in pieces:
-            out[starts[chunk] + np.flatnonzero(lengths == size)] = flat.reshape(-1, size) if size else 0
-        return out.reshape(-1, *shape)
-
-
-def _table(name: str, rows: _Gathered, space: Space, fields: dict[str, Any]) -> StageTable:
-    n, d = len(space.names), len(space.axes)
-    shapes: dict[str, tuple[int, ...]] = {"mean": (n,), "cov": (d, d)}
-    spaces: dict[str, Space] = {}
-    for field, what in fields.items():
-        if "points" in what:
-            spaces[field] = rebuild(what["points"])
-            shapes[f"{field}.points"] = (what["count"], len(spaces[field].names))
-        elif "innovation" in what:
-            measured = rebuild(what["innovation"])
-            assert isinstance(measured, Product)
-            spaces[field] = measured
-            n_z, m, s = len(measured.names), len(measured.axes), len(measured.parts)
-            shapes |= {f"{field}.{part}": (n_z,) for part in ("z", "predicted")}
-            shapes |= {f"{field}.residual": (m,), f"{field}.cov": (m, m), f"{field}.noise": (m, m)}
-            shapes |= {f"{field}.cross_cov": (d, m), f"{field}.blind": (d, s)}
-            shapes |= {f"{field}.{part}": (s,) for part in ("used", "offered")}
-        else:
-            shapes[field] = tuple(what["shape"])
-    values = {column: rows.column(column, shapes.get(column, (-1,))) for column in rows.names()}
-    index = rows.index()
-    return StageTable(name, index["step"], index["stage"], values, spaces)
-
-
-def _ends(steps: np.ndarray, tables: dict[str, StageTable], space: Space) -> tuple[Array, Array]:
-    """The belief at the end of each step: that of the row with the highest place."""
-    n, d = len(space.names), len(space.axes)
-    mean, cov = np.full((len(steps), n), np.nan), np.full((len(steps), d, d), np.nan)
-    highest = np.full(len(steps), -1)
-    for table in tables.values():
-        at = np.searchsorted(steps, table.step)
-        inside = at < len(steps)  # a killed run may have a stage whose step did not reach the file
-        later = np.zeros(len(at), bool)
-        later[inside] = table.place[inside] > highest[at[inside]]
-        highest[at[later]] = table.place[later]
-        mean[at[later]], cov[at[later]] = table.mean[later], table.cov[later]
-    return mean, cov
 
 
 def _texts(batch: pa.RecordBatch) -> dict[str, str]:

@@ -7,7 +7,7 @@ import json
 import os
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,11 @@ import rerun as rr
 
 from viz_estim.core.descriptions import describe
 from viz_estim.core.run import Scenario, Step
-from viz_estim.core.stages import Innovation
+from viz_estim.core.stages import Innovation, Stage
 from viz_estim.recording import blueprints, schema
-from viz_estim.recording.batch import Batch, StageRows
-from viz_estim.recording.columns import Times, numbers, send_static
+from viz_estim.recording.batch import Batch, StageRows, belief_fields
+from viz_estim.recording.bodies import Bodies
+from viz_estim.recording.columns import Times, numbers, once, send_static
 from viz_estim.recording.layout import Layout
 from viz_estim.recording.plots import Plots
 from viz_estim.recording.scenes import Scenes
@@ -27,9 +28,10 @@ from viz_estim.recording.scenes import Scenes
 # A batch is cut by rows and bytes, which the same seed repeats; by time only where steps are so slow that a kill would
 # lose a second of them, or while a viewer watches.
 _ROWS = 1000
-_BYTES = 3 << 19
+_BYTES = 8 << 20
 _SECONDS = 0.6
 _SECONDS_WATCHED = 0.05
+_STAGE = "viz_estim.Stage"
 
 
 class Recorder:
@@ -51,7 +53,8 @@ class Recorder:
     ) -> None:
         self.path, self.partial = path, partial_of(path)
         self._every = every
-        self._layout = Layout(scenario.space, scenario.truth)
+        self._layout = Layout(scenario)
+        self._last: Stage | None = None  # of the steps sent so far
         self._rows: list[Step] = []
         self._limit = 1  # the first step goes out alone: it tells the size of the others, and the view
         self._viewed: list[str] | None = None
@@ -65,9 +68,13 @@ class Recorder:
         self._stream.set_sinks(rr.FileSink(self.partial), *([rr.GrpcSink(live)] if live else []))
         self._stream.send_recording_name(str(properties.get("title", name)))
         self._stream.flush()  # what is logged so far comes before all columns
-        self._scenes = Scenes(self._stream, self._layout, scenario, every)
+        self._bodies = Bodies(self._stream, self._layout, scenario)
+        self._scenes = Scenes(self._stream, self._layout, self._bodies, every)
         self._plots = Plots(self._stream, self._layout)
-        self._properties = dict(properties) | {"space": describe(scenario.space)}
+        belief = scenario.beliefs[0]
+        kind: dict[str, Any] = {"belief": type(belief).__name__, "facts": dict(scenario.facts)}
+        kind |= {"labels": list(belief.labels)} if self._layout.labels else {"space": describe(scenario.space)}
+        self._properties = dict(properties) | kind
         self._send_properties()
         notes = f"{scenario.notes}\n\n{schema.LEGEND}".strip()
         send_static(self._stream, schema.NOTES, rr.TextDocument(notes, media_type="text/markdown"))
@@ -87,12 +94,16 @@ class Recorder:
             if len(self._rows) >= self._limit:
                 self._flush()
 
-    def close(self, result: dict[str, Any] | None = None) -> None:
-        """Ends the recording well: the result is kept with it, and the file takes its own name."""
+    def close(self, result: dict[str, Any] | None = None, *, facts: Mapping[str, float] | None = None) -> None:
+        """Ends the recording well: the result is kept with it, and the file takes its own name.
+
+        facts: the scenario's, with the figures of its last step.
+        """
         self._stop()
         if self._failed:
             raise self._failed
         self._properties["result"] = result
+        self._properties["facts"] |= facts or {}
         self._send_properties()
         self._disconnect()
         os.replace(self.partial, self.path)
@@ -143,18 +154,19 @@ class Recorder:
         steps, self._rows = self._rows, []
         if not steps:
             return
-        batch = Batch(steps, self._places)
-        self._places = batch.end
+        batch = Batch(steps, self._places, self._last)
+        self._places, self._last = batch.end, batch.last
         new = self._layout.learn(batch)
         self._send_steps(batch)
         for rows in batch.stages:
             self._send_stage(rows)
+        self._bodies.add(batch)
         self._scenes.add(batch)
         self._plots.add(batch)
         if new:
             self._send_properties()
-        if self._viewed != (sensors := list(self._layout.sensors)):  # the view is built from these, and sent but once
-            self._viewed = sensors
+        if self._viewed != (known := [*self._layout.sensors, *self._layout.stages]):  # the view is built from these
+            self._viewed = known
             self._stream.send_blueprint(blueprints.build(self._layout))
         if error := steps[-1].error:  # a failure is a run's last step
             text = f"step {error.step}, stage {error.stage}: {error.message}"
@@ -172,8 +184,11 @@ class Recorder:
         columns = [numbers("viz_estim.Step", "dt", np.array([step.tick.dt for step in steps]))]
         # By part, and absent where it is not known: NaN is never written, for it compares unequal to itself.
         optional: dict[str, list[Any]] = {"control": [step.tick.control for step in steps]}
-        for part in self._layout.true_parts:
-            values = batch.truth[:, self._layout.space.at[part]]
+        truths = {name: self._layout.space.at[name] for name in self._layout.true_parts}
+        if self._layout.labels and any(step.truth is not None for step in steps):
+            truths = {"label": slice(0, 1)}
+        for part, where in truths.items():
+            values = batch.truth[:, where]
             missing = set(np.flatnonzero(~np.isfinite(values).all(axis=1)).tolist())
             optional[f"truth.{part}"] = [None if row in missing else x for row, x in enumerate(values)]
         for sensor in self._layout.inputs:
@@ -187,24 +202,33 @@ class Recorder:
         self._send(schema.STEPS, batch.times, columns)
 
     def _send_stage(self, rows: StageRows) -> None:
-        kind = "viz_estim.Stage"
-        columns = [numbers(kind, name, rows.values(f"belief.{name}")) for name in ("mean", "cov")]
+        columns = [self._column(rows, f"belief.{name}", name) for name in belief_fields(rows.stages[0].belief)]
         kept = rows.at.step % self._every == 0
         for field, what in self._layout.stages[rows.name].items():
             if "points" in what:
-                points = rows.values(f"{field}.points")
-                if not kept.all():
+                mine = kept & ~rows.shared(field, what["same_as"][1]) if "same_as" in what else kept
+                if mine.all():
+                    columns.append(self._column(rows, f"{field}.points"))
+                elif mine.any():
+                    points = rows.objects(f"{field}.points")
                     columns.append(
-                        numbers(kind, f"{field}.points", [p if k else None for p, k in zip(points, kept, strict=True)])
+                        numbers(
+                            _STAGE, f"{field}.points", [p if k else None for p, k in zip(points, mine, strict=True)]
+                        )
                     )
-                else:
-                    columns.append(numbers(kind, f"{field}.points", points))
             elif "innovation" in what:
                 parts = [part for part in Innovation.__slots__ if part != "space"]
-                columns += [numbers(kind, f"{field}.{part}", rows.values(f"{field}.{part}")) for part in parts]
-            else:
-                columns.append(numbers(kind, field, rows.values(field)))
+                columns += [self._column(rows, f"{field}.{part}") for part in parts]
+            elif "shape" in what:
+                columns.append(self._column(rows, field))
         self._send(schema.stage(rows.name), rows.at, columns)
+
+    def _column(self, rows: StageRows, path: str, name: str | None = None) -> rr.ComponentColumn:
+        """A quantity of the stage; once, where all rows hold the same object (a constant noise, say)."""
+        found = rows.objects(path)
+        if len(found) > 1 and found[0] is found[-1] and all(value is found[0] for value in found):
+            return once(_STAGE, name or path, found[0], len(found))
+        return numbers(_STAGE, name or path, rows.values(path))
 
 
 def partial_of(path: Path) -> Path:

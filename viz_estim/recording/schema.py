@@ -20,6 +20,7 @@ SENSORS: dict[str, Colour] = {
     "olive": (150, 190, 90),
 }
 BAND: Colour = (120, 120, 130)
+SCENERY: Colour = (150, 150, 160)
 AXES: tuple[Colour, ...] = ((235, 70, 70), (80, 200, 90), (80, 130, 255))  # x, y, z
 HEALTH: dict[str, Colour] = {
     "used": (60, 120, 75),
@@ -28,6 +29,8 @@ HEALTH: dict[str, Colour] = {
     "frozen, rejected": (150, 70, 70),
     "absent": (70, 70, 70),
 }
+
+_MORE: tuple[Colour, ...] = ((230, 200, 60), (200, 110, 220), (60, 200, 200))
 
 LEGEND = (
     "**Colours:** amber is the estimate, white the truth, grey lines its bounds, each sensor has its own; red, green "
@@ -38,7 +41,10 @@ STEPS = "/steps"
 NOTES = "/notes"
 EVENTS = "/events"
 LANES = "/lanes"
+ATTITUDE = "/attitude"
 WORLD = "/world"
+BARS = "/bars"
+BAR = 0.5  # from one bar to the next, where 1 is a probability of 1
 PLOTS = "/plots"
 
 
@@ -53,6 +59,18 @@ def stage_colours(names: list[str]) -> dict[str, Colour]:
 def sensor_colour(place: int) -> tuple[str, Colour]:
     """The colour's name and value for the sensor that came at that place."""
     return list(SENSORS.items())[place % len(SENSORS)]
+
+
+def line_colours(count: int) -> list[Colour]:
+    """Colours for as many lines in one plot: the axes' three, then others that stand apart."""
+    return [(*AXES, *_MORE)[i % (len(AXES) + len(_MORE))] for i in range(count)]
+
+
+def shades(colour: Colour, count: int) -> list[Colour]:
+    """The colour of a sensor, for each of its components: full, pale, dark, and again."""
+    r, g, b = colour
+    pale = (r // 2 + 125, g // 2 + 125, b // 2 + 125)
+    return [((r, g, b), pale, (r // 2, g // 2, b // 2))[i % 3] for i in range(count)]
 
 
 def stage(name: str) -> str:

@@ -133,9 +133,11 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
     def snapshot(self, path: str | Path, settle: float = 10.0) -> bool:
         """Writes the whole viewer as a PNG, whole or not at all; False if it still changed after `settle` seconds."""
         png, path, part = b"", Path(path), Path(f"{path}.{os.getpid()}.part")
-        for _ in _polls(settle):  # chunks load and plots lay out over several frames: two equal ones end it
+        equal = 0
+        for _ in _polls(settle):  # chunks load and plots lay out over several frames: some equal ones end it
             before, png = png, self._ask(self._client.take_screenshot)
-            if still := png == before and not self._state().loading:
+            equal = equal + 1 if png == before and not self._state().loading else 0
+            if still := equal >= 3:
                 break
         try:
             part.write_bytes(png)

@@ -22,7 +22,8 @@ from viz_estim.core.spaces import S2, SO3, Euclidean, Product
 from viz_estim.core.stages import Predict, Stage
 from viz_estim.core.unscented import UnscentedFilter, symmetric
 from viz_estim.errors import BadInput
-from viz_estim.scenarios import imu_files, imu_simulation
+from viz_estim.scenarios import imu_files, imu_fit, imu_simulation
+from viz_estim.scenarios.checks import positive, probability
 from viz_estim.scenarios.imu_data import ImuData, prepare
 from viz_estim.scenarios.imu_health import GRAVITY
 
@@ -70,11 +71,16 @@ def save(data: ImuData, folder: Path) -> list[Path]:
     return imu_files.save_course(folder, 1, data.log)
 
 
+def calibrate(paths: list[Path]) -> imu_fit.Fit:
+    """The sensor's constants, fitted to motion capture over all sets among the paths."""
+    return imu_fit.fit([imu_files.load(*one) for one in imu_files.find_sets(paths)])
+
+
 def imu_gyro(
     data: ImuData, *, initial: Initial = "accel", gyro_noise: float = 0.015, initial_attitude_std: float = 0.05
 ) -> Scenario:
     """The gyro's rates integrated, nothing else: what drift and a freeze do to dead reckoning."""
-    _positive(gyro_noise=gyro_noise, initial_attitude_std=initial_attitude_std)
+    positive(gyro_noise=gyro_noise, initial_attitude_std=initial_attitude_std)
     space = Product(attitude=SO3())
     cov = initial_attitude_std**2 * np.eye(3)
     beliefs = _beliefs(data, initial, lambda q: Gaussian(space, q, cov))
@@ -106,8 +112,8 @@ def imu_ukf(
     gate is the probability with which a good reading passes. The defaults bring both sensors' NIS, pooled over the
     course's three sets, to the 3 that it should be.
     """
-    _positive(gyro_noise=gyro_noise, accel_noise=accel_noise, attitude_walk=attitude_walk, rate_walk=rate_walk)
-    _positive(initial_attitude_std=initial_attitude_std, initial_rate_std=initial_rate_std)
+    positive(gyro_noise=gyro_noise, accel_noise=accel_noise, attitude_walk=attitude_walk, rate_walk=rate_walk)
+    positive(initial_attitude_std=initial_attitude_std, initial_rate_std=initial_rate_std)
     space = Product(attitude=SO3(), rate=_RATE)
     Q_per_s = np.diag([attitude_walk**2] * 3 + [rate_walk**2] * 3)
     Q_unseen = np.diag([attitude_walk**2] * 3 + [max(rate_walk, _UNSEEN_RATE_WALK) ** 2] * 3)
@@ -120,10 +126,10 @@ def imu_ukf(
         Euclidean(("x", "y", "z"), "m/s²"),
         lambda x: GRAVITY * _up_in_body(x),
         accel_noise**2 * np.eye(3),
-        _probability("accel_gate", accel_gate),
+        probability("accel_gate", accel_gate),
         lambda mean: np.concatenate([_up_in_body(mean), np.zeros_like(mean[..., 4:])], axis=-1),
     )
-    gyroscope = Sensor(_RATE, lambda x: x[..., 4:], gyro_noise**2 * np.eye(3), _probability("gyro_gate", gyro_gate))
+    gyroscope = Sensor(_RATE, lambda x: x[..., 4:], gyro_noise**2 * np.eye(3), probability("gyro_gate", gyro_gate))
     estimator = UnscentedFilter(
         constant_rate,
         lambda tick: (Q_unseen if tick.stand_ins else Q_per_s) * tick.dt,
@@ -156,7 +162,7 @@ def imu_ukf_gyro(
     initial_attitude_std: float = 0.05,
 ) -> Scenario:
     """A UKF on attitude alone: the gyro drives the prediction, the accelerometer's direction corrects it."""
-    _positive(gyro_noise=gyro_noise, accel_noise=accel_noise, initial_attitude_std=initial_attitude_std)
+    positive(gyro_noise=gyro_noise, accel_noise=accel_noise, initial_attitude_std=initial_attitude_std)
     space = Product(attitude=SO3())
 
     def turned_by_gyro(x: Array, tick: Tick) -> Array:
@@ -167,7 +173,7 @@ def imu_ukf_gyro(
         return (std * tick.dt) ** 2 * np.eye(3)
 
     accelerometer = Sensor(
-        S2(), _up_in_body, (accel_noise / GRAVITY) ** 2 * np.eye(2), _probability("accel_gate", accel_gate), _up_in_body
+        S2(), _up_in_body, (accel_noise / GRAVITY) ** 2 * np.eye(2), probability("accel_gate", accel_gate), _up_in_body
     )
     estimator = UnscentedFilter(turned_by_gyro, rate_noise, Measurement({"accel": accelerometer}), symmetric(3))
     cov = initial_attitude_std**2 * np.eye(3)
@@ -249,18 +255,6 @@ def _tick(
 def _rate(tick: Tick) -> Array:
     assert tick.control is not None
     return tick.control
-
-
-def _positive(**values: float) -> None:
-    for name, value in values.items():
-        if not (value > 0 and np.isfinite(value)):
-            raise BadInput(f"{name} must be a positive number, got {value:g}")
-
-
-def _probability(name: str, value: float | None) -> float | None:
-    if value is not None and not 0 < value < 1:
-        raise BadInput(f"{name} is a probability between 0 and 1, such as 0.999, got {value:g}")
-    return value
 
 
 def _notes(text: str, data: ImuData) -> str:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.io
@@ -18,6 +17,7 @@ import scipy.io
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.errors import BadInput
+from viz_estim.scenarios.reading import expand, field, finite, read_columns, read_mat, shape_text, unreadable
 
 _CHANNELS = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 _QUATERNION = ("qw", "qx", "qy", "qz")
@@ -44,7 +44,7 @@ class ImuLog:
 
 def find_sets(paths: list[Path]) -> list[tuple[Path, Path | None]]:
     """The IMU files among files and folders, each with its motion capture: given, or found beside it by its number."""
-    files = [file for path in paths for file in _expand(path)]
+    files = [file for path in paths for file in expand(path, _SUFFIXES)]
     roles = {file: _role(file, strict=file in paths) for file in dict.fromkeys(files)}
     imus = [file for file, role in roles.items() if role == "imu"]
     truths = [file for file, role in roles.items() if role == "truth"]
@@ -60,12 +60,12 @@ def load(imu: Path, truth: Path | None) -> ImuLog:
     """The IMU file read and checked, with its reference."""
     if imu.suffix.lower() == ".mat":
         return _load_course(imu, truth)
-    columns = _read_columns(imu)
+    columns = read_columns(imu, "time")
     missing = [c for c in ("time", *_CHANNELS) if c not in columns]
     if missing:
         raise BadInput(f"{imu}: missing {', '.join(missing)} (columns: {', '.join(columns)})")
     stamps = _stamps(columns["time"], imu, "time")
-    values = {c: _finite(columns[c], imu, c) for c in _CHANNELS}
+    values = {c: finite(columns[c], imu, c) for c in _CHANNELS}
     gyro, accel = (np.stack([values[f"{kind}_{axis}"] for axis in "xyz"], axis=1) for kind in ("gyro", "accel"))
     files: tuple[Path, ...] = (imu,)
     reference = np.empty(0), np.empty((0, 4))
@@ -93,14 +93,6 @@ def save_course(folder: Path, number: int, log: ImuLog) -> list[Path]:
     return [imu, truth]
 
 
-def _expand(path: Path) -> list[Path]:
-    if path.is_dir():
-        return [file for file in sorted(path.iterdir()) if file.suffix.lower() in _SUFFIXES]
-    if not path.exists():
-        raise BadInput(f"{path}: no such file or folder")
-    return [path]
-
-
 def _role(path: Path, *, strict: bool) -> str | None:
     """imu, truth, camera or None by the file's fields; None is an error for a file that was named itself."""
     if path.suffix.lower() not in _SUFFIXES:
@@ -110,14 +102,14 @@ def _role(path: Path, *, strict: bool) -> str | None:
             fields = {name for name, *_ in scipy.io.whosmat(path)}
             role = "truth" if "rots" in fields else "imu" if "vals" in fields else "camera" if "cam" in fields else None
         else:
-            role = "imu" if "time" in _read_columns(path) else None
+            role = "imu" if "time" in read_columns(path, "time") else None
     except BadInput:
         if strict:
             raise
         return None
     except Exception as error:  # scipy raises whatever a damaged file makes it trip over
         if strict:
-            raise _unreadable(path, error) from error
+            raise unreadable(path, error) from error
         return None
     if role is None and strict:
         raise BadInput(
@@ -143,13 +135,13 @@ def _number(path: Path) -> str | None:
 
 
 def _load_course(imu: Path, truth: Path | None) -> ImuLog:
-    fields = _read_mat(imu)
-    vals = _field(fields, "vals", imu)
+    fields = read_mat(imu)
+    vals = field(fields, "vals", imu)
     if vals.ndim != 2 or vals.shape[0] != 6:
-        raise BadInput(f"{imu}: expected `vals` of shape 6×T (ax, ay, az, wz, wx, wy), got {_shape(vals)}")
+        raise BadInput(f"{imu}: expected `vals` of shape 6×T (ax, ay, az, wz, wx, wy), got {shape_text(vals)}")
     # Unsigned counts wrap around when a bias is subtracted: floats from here on.
-    vals = _finite(vals.astype(float), imu, "vals")
-    stamps = _stamps(_field(fields, "ts", imu).astype(float).ravel(), imu, "ts")
+    vals = finite(vals.astype(float), imu, "vals")
+    stamps = _stamps(field(fields, "ts", imu).astype(float).ravel(), imu, "ts")
     if len(stamps) != vals.shape[1]:
         raise BadInput(f"{imu}: `ts` has {len(stamps)} stamps and `vals` {vals.shape[1]} columns; they must agree")
     reference = (np.empty(0), np.empty((0, 4))) if truth is None else _load_truth(truth)
@@ -158,11 +150,11 @@ def _load_course(imu: Path, truth: Path | None) -> ImuLog:
 
 
 def _load_truth(path: Path) -> tuple[Array, Array]:
-    fields = _read_mat(path)
-    rots = _field(fields, "rots", path).astype(float)
+    fields = read_mat(path)
+    rots = field(fields, "rots", path).astype(float)
     if rots.ndim != 3 or rots.shape[:2] != (3, 3):
-        raise BadInput(f"{path}: expected `rots` of shape 3×3×N, got {_shape(rots)}")
-    stamps = _field(fields, "ts", path).astype(float).ravel()
+        raise BadInput(f"{path}: expected `rots` of shape 3×3×N, got {shape_text(rots)}")
+    stamps = field(fields, "ts", path).astype(float).ravel()
     if len(stamps) != rots.shape[2]:
         raise BadInput(f"{path}: `ts` has {len(stamps)} stamps and `rots` {rots.shape[2]} frames; they must agree")
     matrices = np.moveaxis(rots, -1, 0)
@@ -182,84 +174,11 @@ def _good_truth(stamps: Array, q: Array, path: Path) -> tuple[Array, Array]:
     return stamps[good], quaternions.continuous(quaternions.normalise(q[good]))
 
 
-def _read_mat(path: Path) -> dict[str, Any]:
-    try:
-        fields: dict[str, Any] = scipy.io.loadmat(path)
-    except Exception as error:  # scipy raises whatever a damaged file makes it trip over
-        raise _unreadable(path, error) from error
-    return fields
-
-
-def _read_columns(path: Path) -> dict[str, Array]:
-    try:
-        if path.suffix.lower() == ".npz":
-            with np.load(path, allow_pickle=False) as file:
-                columns = {name: np.asarray(file[name], float) for name in file.files}
-        else:
-            with path.open(encoding="utf-8-sig") as text:
-                names = [name.strip() for name in text.readline().split(",")]
-                rows = [line.split(",") for line in text if line.strip()]
-            columns = {name: np.array(values) for name, values in zip(names, _cells(path, names, rows), strict=True)}
-    except BadInput:
-        raise
-    except Exception as error:
-        raise _unreadable(path, error) from error
-    if any(
-        column.ndim != 1 or column.shape != columns["time"].shape for column in columns.values() if "time" in columns
-    ):
-        raise BadInput(f"{path}: all columns must be one-dimensional and as long as `time`")
-    return columns
-
-
-def _cells(path: Path, names: list[str], rows: list[list[str]]) -> list[list[float]]:
-    """The columns of a table of texts; an empty cell is NaN."""
-    if not rows:
-        raise BadInput(f"{path}: is empty, or holds column names alone")
-    columns: list[list[float]] = [[] for _ in names]
-    for number, row in enumerate(rows, 2):
-        if len(row) != len(names):
-            raise BadInput(f"{path}: line {number} has {len(row)} cells, the first line {len(names)}")
-        for column, name, cell in zip(columns, names, row, strict=True):
-            try:
-                column.append(float(cell) if cell.strip() else np.nan)
-            except ValueError:
-                raise BadInput(f"{path}: line {number}, {name}: {cell.strip()!r} is not a number") from None
-    return columns
-
-
-def _unreadable(path: Path, error: Exception) -> BadInput:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return BadInput(f"{path}: cannot be read, it may be truncated or of another format ({text[:120]})")
-
-
-def _field(fields: dict[str, Any], name: str, path: Path) -> np.ndarray:
-    if name not in fields:
-        held = ", ".join(k for k in fields if not k.startswith("__")) or "nothing"
-        raise BadInput(f"{path}: no field `{name}` (it holds {held})")
-    value = np.asarray(fields[name])
-    if value.dtype.kind not in "uifb":
-        raise BadInput(f"{path}: `{name}` must hold numbers")
-    return value
-
-
-def _finite(values: Array, path: Path, name: str) -> Array:
-    bad = ~np.isfinite(values)
-    if bad.any():
-        raise BadInput(
-            f"{path}: {name} is not a number at sample {np.argwhere(bad)[0][-1]}; measurements must be finite"
-        )
-    return values
-
-
 def _stamps(stamps: Array, path: Path, name: str) -> Array:
     if len(stamps) < 2:
         raise BadInput(f"{path}: {name} has {len(stamps)} samples; at least 2 are needed")
-    _finite(stamps, path, name)
+    finite(stamps, path, name)
     back = np.flatnonzero(np.diff(stamps) < 0)
     if len(back):
         raise BadInput(f"{path}: {name} goes back at sample {back[0] + 1}; sort the samples by time")
     return stamps
-
-
-def _shape(array: np.ndarray) -> str:
-    return "×".join(map(str, array.shape)) or "a single number"

@@ -1,0 +1,111 @@
+"""What a weighted cloud says: its mean and covariance on the manifold, and its modes where it has several."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import Space
+
+_ROUNDS = 30
+_REACH = 5.0  # σ either way: a mode of weight p lies at most 1/√p away
+_SMOOTH = 2.0  # cells to a kernel's σ
+_TRUSTED = 100.0  # after a resampling the ESS counts copies: no finer a kernel than for so many draws
+_VALLEY = 0.5  # of the lower peak: what separates two modes is at most as dense
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """A part of a cloud that stands apart: its share of the weight, its mean (n,) and its covariance (d, d)."""
+
+    weight: float
+    mean: Array
+    cov: Array
+
+
+def moments(space: Space, states: Array, log_weights: Array) -> tuple[Array, Array]:
+    """The mean (*, n) of states (*, N, n) on the manifold, and their covariance (*, d, d) in the tangent space there.
+
+    The fixed point m = m ⊞ Σ wᵢ (xᵢ ⊟ m), started at the heaviest particle (Pennec 1998). Angles spread all around have
+    none; theirs is where the iteration stands when it is given up, and their covariance says how little that means.
+    """
+    weights = np.exp(log_weights)[..., None, :]
+    heaviest = log_weights.argmax(-1)[..., None, None]
+    mean = np.take_along_axis(states, heaviest, axis=-2)
+    settled = max(1e-10, 64 * np.finfo(float).eps * float(np.abs(states).max()))
+    for _ in range(_ROUNDS):
+        step = weights @ space.minus(states, mean)
+        mean = space.plus(mean, step)
+        if np.abs(step).max() < settled:
+            break
+    error = space.minus(states, mean)
+    cov = (np.swapaxes(error, -1, -2) * weights) @ error
+    return mean[..., 0, :], 0.5 * (cov + np.swapaxes(cov, -1, -2))
+
+
+def modes(space: Space, states: Array, log_weights: Array, least: float = 0.05) -> tuple[Mode, ...]:
+    """The modes of one cloud, states (N, n), that hold at least a share `least` of its weight; the heaviest first.
+
+    Of the density over the components in metres (over the changes from the mean, where there are none; the first three
+    of either), a histogram smoothed with Silverman's width (1986, eq. 4.14): each cell climbs to its peak, and peaks
+    without a valley between them are one mode. Clouds that differ in heading alone are one mode.
+    """
+    weights = np.exp(log_weights)
+    metres = [i for i, unit in enumerate(space.units) if unit == "m"]
+    points = states[:, metres] if metres else space.minus(states, moments(space, states, log_weights)[0])
+    cell, density = _histogram(points[:, :3], weights)
+    label = _basins(density)[cell]
+    share = np.bincount(label, weights)
+    found = []
+    for i in np.flatnonzero(share >= least):
+        members = label == i
+        mean, cov = moments(space, states[members], log_weights[members] - np.log(share[i]))
+        found.append(Mode(float(share[i]), mean, cov))
+    return tuple(sorted(found, key=lambda mode: -mode.weight))
+
+
+def _histogram(points: Array, weights: Array) -> tuple[np.ndarray, Array]:
+    """The cell of each point (N,) in a smoothed histogram over as many axes as points (N, d) have, and that."""
+    d = points.shape[1]
+    centred = points - weights @ points
+    std = np.sqrt(weights @ centred**2)
+    width = min(1 / float(weights @ weights), _TRUSTED) ** (-1 / (d + 4))
+    size = width / _SMOOTH * np.where(std > 0, std, 1.0)
+    half = int(np.ceil(_REACH * _SMOOTH / width))
+    at = np.clip(np.floor(centred / size), -half, half - 1).astype(int) + half
+    cell = np.ravel_multi_index(tuple(at.T), (2 * half,) * d)
+    histogram = np.bincount(cell, weights, (2 * half) ** d).reshape((2 * half,) * d)
+    return cell, gaussian_filter(histogram, _SMOOTH, mode="constant")
+
+
+def _basins(density: Array) -> np.ndarray:
+    """The mode's number of each cell, flat."""
+    # Ranks instead of densities, so that no two cells are as high, and a rank names its cell.
+    order = density.ravel().argsort(kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(order.size)
+    peak = order[maximum_filter(rank.reshape(density.shape), size=3)].ravel()
+    while (peak != peak[peak]).any():
+        peak = peak[peak]
+    height = density.ravel()[peak].reshape(density.shape)
+    basin = peak.reshape(density.shape)
+    joined = []
+    for axis in range(density.ndim):
+        (low, high), (a, b), (one, other) = (_neighbours(x, axis) for x in (density, height, basin))
+        no_valley = np.minimum(low, high) > _VALLEY * np.minimum(a, b)
+        joined.append(np.stack([one[no_valley], other[no_valley]]))
+    edges = np.concatenate(joined, axis=1)
+    graph = coo_array((np.ones(edges.shape[1]), edges), shape=(order.size,) * 2)
+    label: np.ndarray = connected_components(graph, directed=False)[1]
+    return label[peak]
+
+
+def _neighbours(x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """All pairs of cells that are next to each other along an axis."""
+    x = np.moveaxis(x, axis, 0)
+    return x[:-1], x[1:]

@@ -1,0 +1,115 @@
+"""The particle filter: propagate, weigh, resample.
+
+Gordon, Salmond and Smith (1993); Doucet and Johansen, *A tutorial on particle filtering and smoothing* (2011),
+algorithm of section 4.1. Weights are logarithms throughout. All functions take leading batch axes: states (*, N, n),
+log weights (*, N).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from viz_estim.core.beliefs import Particles
+from viz_estim.core.discrete import LOG_ZERO
+from viz_estim.core.quaternions import Array
+from viz_estim.core.resampling import METHODS, Method
+from viz_estim.core.run import Tick
+from viz_estim.core.spaces import Space
+from viz_estim.core.stages import Predict, Resample, Stage, Weigh, names_its_failures
+
+Propagate = Callable[[Array, Tick, np.random.Generator], Array]
+LogLikelihood = Callable[[Array, Tick], Array]
+
+
+def equal(space: Space, states: Array) -> Particles:
+    """The belief with these states (*, N, n), all of the same weight."""
+    N = states.shape[-2]
+    return Particles(space, states, np.full(states.shape[:-1], -np.log(N)))
+
+
+@names_its_failures
+def predict(
+    belief: Particles, propagate: Propagate, tick: Tick, rng: np.random.Generator, *, name: str = "predict"
+) -> Predict:
+    """The belief after each particle is drawn anew from the process model, p(x' | x): the weights stay."""
+    return Predict(name, Particles(belief.space, propagate(belief.states, tick, rng), belief.log_weights))
+
+
+@names_its_failures
+def weigh(belief: Particles, log_likelihood: LogLikelihood, tick: Tick, *, name: str = "weigh") -> Weigh:
+    """The belief after the tick's readings z: log w' = log w + log p(z | x) − log Σ w·p(z | x).
+
+    ArithmeticError where no particle can give the readings.
+    """
+    log_likelihoods = np.maximum(log_likelihood(belief.states, tick), LOG_ZERO)  # log 0 is a number here
+    log_weights = belief.log_weights + log_likelihoods
+    best = log_weights.max(axis=-1, keepdims=True)
+    if not (best > LOG_ZERO / 2).all():  # nor NaN
+        raise ArithmeticError("no particle has a likelihood above 0: none can give what was read")
+    weights = np.exp(log_weights - best)
+    total = weights.sum(axis=-1)
+    evidence = best[..., 0] + np.log(total)
+    log_weights -= evidence[..., None]
+    ess = total**2 / (weights[..., None, :] @ weights[..., :, None])[..., 0, 0]
+    after = Particles(belief.space, belief.states, log_weights)
+    return Weigh(name, after, log_likelihoods, np.asarray(evidence), np.asarray(ess))
+
+
+@names_its_failures
+def resample(
+    belief: Particles,
+    rng: np.random.Generator,
+    method: Method = "systematic",
+    where: np.ndarray | None = None,
+    *,
+    name: str = "resample",
+) -> Resample:
+    """The belief with N equal weights, each particle copied in proportion to the weight that it had.
+
+    where (*,): the members of a batch that are resampled; the others stay as they are, each its own ancestor.
+    """
+    weights = np.exp(belief.log_weights)
+    copies = METHODS[method](weights, rng)
+    N, n = belief.states.shape[-2:]
+    log_weights = np.full(weights.shape, -np.log(N))
+    if where is not None:
+        copies = np.where(where[..., None], copies, 1)
+        log_weights = np.where(where[..., None], log_weights, belief.log_weights)
+    chosen = np.repeat(np.arange(copies.size), copies.ravel())
+    states = belief.states.reshape(-1, n).take(chosen, axis=0).reshape(belief.states.shape)
+    ancestors = (chosen if copies.ndim == 1 else chosen % N).reshape(copies.shape)
+    distinct = np.asarray(np.count_nonzero(copies, axis=-1), float)
+    return Resample(name, Particles(belief.space, states, log_weights), ancestors, distinct, np.asarray(belief.ess))
+
+
+@dataclass(frozen=True)
+class ParticleFilter:
+    """An estimator: particles are propagated, weighed where the tick has readings, and then resampled.
+
+    propagate(states, tick, rng) draws states (*, N, n) over tick.dt; log_likelihood(states, tick) is log p(z | x)
+    (*, N) of all readings of the tick. threshold: resampled where the effective sample size is below this fraction
+    of N; at 1 always.
+    """
+
+    propagate: Propagate
+    log_likelihood: LogLikelihood
+    resampling: Method = "systematic"
+    threshold: float = 1.0
+
+    def step(self, belief: Particles, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
+        if tick.dt > 0:
+            moved = predict(belief, self.propagate, tick, rng)
+            yield moved
+            belief = moved.belief
+        if not tick.measurements:
+            return
+        weighed = weigh(belief, self.log_likelihood, tick)
+        yield weighed
+        low = weighed.ess < self.threshold * belief.states.shape[-2]
+        if self.threshold >= 1 or low.all():
+            yield resample(weighed.belief, rng, self.resampling)
+        elif low.any():
+            yield resample(weighed.belief, rng, self.resampling, low)

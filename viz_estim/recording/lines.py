@@ -1,0 +1,72 @@
+"""Lines over time, as Rerun draws them: one entity a plot where it can, broken where a value is missing."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from viz_estim.core.quaternions import Array
+from viz_estim.recording import schema
+from viz_estim.recording.columns import Times, drawn, send_static
+
+Series = tuple[str, schema.Colour, Array]  # name, colour, values (N,)
+
+
+class Lines:
+    """Draws series into the plots of a stream, and styles each plot once."""
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self._stream = stream
+        self._styled: set[str] = set()
+        self._known: dict[str, bool] = {}  # by broken line: whether it has a value last
+
+    def draw(self, path: str, at: Times, unit: str, series: list[Series], variance: Array | None = None) -> None:
+        """Lines in one plot, the last on top; the variance (N,) is that one's, drawn as a band."""
+        self._style(path, unit, series)
+        components = {"values": np.stack([values for _, _, values in series], axis=1)}
+        if variance is not None:
+            components["variances"] = np.zeros_like(components["values"])
+            components["variances"][:, -1] = variance
+        columns = drawn(rr.Measurements, len(series), len(at), **components)
+        rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)
+
+    def within(self, path: str, at: Times, unit: str, line: Series, variance: Array, *, gapless: bool) -> None:
+        """A value between the lines at ±3σ that it should stay within. gapless: it is known in every row of the run,
+        so that all three can be one entity (a plot refuses rows of several lengths)."""
+        unit, scale = shown(unit)
+        bound = 3 * scale * np.sqrt(np.maximum(variance, 0))
+        bounds: list[Series] = [("+3σ", schema.BAND, bound), ("−3σ", schema.BAND, -bound)]
+        scaled = (line[0], line[1], scale * line[2])
+        if gapless:
+            self.draw(path, at, unit, [*bounds, scaled])
+        else:
+            self.draw(path, at, unit, bounds)
+            self.broken(f"{path}/value", at, unit, scaled)
+
+    def broken(self, path: str, at: Times, unit: str, series: Series) -> None:
+        """One line that is broken where its value is NaN: by a row without a value, where the gap begins."""
+        name, colour, values = series
+        known = np.isfinite(values)
+        before = np.concatenate([[self._known.get(path, False)], known[:-1]])
+        self._known[path] = bool(known[-1])
+        rows = np.flatnonzero(known | before)
+        if len(rows):
+            at, drawn_values = (at, values) if len(rows) == len(at) else (at.pick(rows), values[rows])
+            counts = np.isfinite(drawn_values)
+            self._style(path, unit, [(name, colour, drawn_values)])
+            columns = drawn(rr.Measurements, counts.astype(int), len(at), values=drawn_values[counts])
+            rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)
+
+    def _style(self, path: str, unit: str, series: list[Series]) -> None:
+        if path not in self._styled:
+            self._styled.add(path)
+            names, colours, _ = zip(*series, strict=True)
+            style = rr.Measurements.from_fields(
+                names=names, colors=colours, units=[unit] * len(names), aggregation_policy="MinMax"
+            )
+            send_static(self._stream, path, style)
+
+
+def shown(unit: str) -> tuple[str, float]:
+    """The unit in which a quantity is drawn, and the factor to it: angles in degrees."""
+    return ("deg", 180 / np.pi) if unit == "rad" else (unit, 1.0)

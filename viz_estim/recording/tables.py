@@ -1,0 +1,148 @@
+"""The rows of a recording's entities, gathered chunk by chunk into arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from viz_estim.core.descriptions import rebuild
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import Product, Space
+
+
+@dataclass(frozen=True)
+class StageTable:
+    """All rows of one stage: step (M,), place (M,) on the stage timeline, and its numbers by name, (M, …).
+
+    `mean` (M, n) and `cov` (M, d, d) are there always; the others are named `field` or `field.part`, such as
+    `gain`, `innovation.residual`, `sigma.points`. A quantity that only some rows have holds NaN in the others.
+    """
+
+    name: str
+    step: np.ndarray
+    place: np.ndarray
+    values: dict[str, Array]
+    spaces: dict[str, Space]
+
+    @property
+    def mean(self) -> Array:
+        return self.values["mean"]
+
+    @property
+    def cov(self) -> Array:
+        return self.values["cov"]
+
+
+class Gathered:
+    """The rows of one entity, chunk by chunk."""
+
+    def __init__(self, points: bool = True) -> None:
+        self.times: list[dict[str, np.ndarray]] = []
+        self.columns: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {}  # chunk number, lengths, flat values
+        self._points = points
+
+    def add(self, batch: pa.RecordBatch) -> None:
+        if not {"step", "time", "stage"} <= set(batch.schema.names):  # not ours
+            return
+        nanoseconds = batch.column("time").cast(pa.int64()).to_numpy()
+        times = {name: batch.column(name).to_numpy() for name in ("step", "stage")}
+        self.times.append(times | {"time": nanoseconds / 1e9})
+        for name in batch.schema.names:
+            component = name.partition(":")[2]
+            if component and (self._points or not component.endswith(".points")):
+                column = batch.column(name)
+                lengths = column.value_lengths().fill_null(0).to_numpy()
+                entry = (len(self.times) - 1, lengths, column.flatten().to_numpy())
+                self.columns.setdefault(component, []).append(entry)
+
+    def names(self) -> list[str]:
+        return list(self.columns)
+
+    def index(self) -> dict[str, np.ndarray]:
+        return {key: np.concatenate([times[key] for times in self.times]) for key in ("step", "stage", "time")}
+
+    def column(self, name: str, shape: tuple[int, ...], *, fill: bool = False) -> Array:
+        """The values (rows, *shape), NaN where a row has none; a −1 in the shape is found from the longest row.
+
+        fill: a row without one has that of the row before it.
+        """
+        counts = [len(times["step"]) for times in self.times]
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        pieces = self.columns.get(name, [])
+        if -1 in shape:
+            longest = max((int(lengths.max(initial=0)) for _, lengths, _ in pieces), default=0)
+            known = int(np.prod([v for v in shape if v != -1]))
+            shape = tuple(longest // known if v == -1 else v for v in shape)
+        size = int(np.prod(shape))
+        out = np.full((int(starts[-1]), size), np.nan)
+        for chunk, lengths, flat in pieces:
+            rows = np.flatnonzero(lengths == size)
+            out[starts[chunk] + rows] = flat.reshape(-1, size) if size else 0
+            if fill and len(rows) and size:  # what all rows share is kept in the first alone
+                source = rows[np.maximum(np.searchsorted(rows, np.arange(counts[chunk]), side="right") - 1, 0)]
+                out[starts[chunk] : starts[chunk] + counts[chunk]] = out[starts[chunk] + source]
+        return out.reshape(-1, *shape)
+
+
+def table_of(name: str, rows: Gathered, space: Space, fields: dict[str, Any]) -> StageTable:
+    n, d = len(space.names), len(space.axes)
+    shapes: dict[str, tuple[int, ...]] = {"mean": (n,), "cov": (d, d)}
+    spaces: dict[str, Space] = {}
+    for field, what in fields.items():
+        if "points" in what:
+            spaces[field] = rebuild(what["points"])
+            shapes[f"{field}.points"] = (what["count"], len(spaces[field].names))
+        elif "innovation" in what:
+            measured = rebuild(what["innovation"])
+            assert isinstance(measured, Product)
+            spaces[field] = measured
+            n_z, m, s = len(measured.names), len(measured.axes), len(measured.parts)
+            shapes |= {f"{field}.{part}": (n_z,) for part in ("z", "predicted")}
+            shapes |= {f"{field}.residual": (m,), f"{field}.cov": (m, m), f"{field}.noise": (m, m)}
+            shapes |= {f"{field}.cross_cov": (d, m), f"{field}.blind": (d, s)}
+            shapes |= {f"{field}.{part}": (s,) for part in ("used", "offered")}
+        elif "shape" in what:
+            shapes[field] = tuple(what["shape"])
+    values = {
+        column: rows.column(column, shapes.get(column, (-1,)), fill=not column.endswith(".points"))
+        for column in rows.names()
+    }
+    index = rows.index()
+    return StageTable(name, index["step"], index["stage"], values, spaces)
+
+
+def fill_in(tables: dict[str, StageTable], fields: dict[str, Any]) -> None:
+    """Points that are those of the stage before were kept once: they are put where they belong."""
+    for table in tables.values():
+        for field, what in fields.get(table.name, {}).items():
+            stage, earlier = what.get("same_as", (None, None))
+            if stage in tables and f"{earlier}.points" in tables[stage].values:
+                source = tables[stage]
+                theirs = source.values[f"{earlier}.points"]
+                name = f"{field}.points"
+                mine = table.values.setdefault(name, np.full((len(table.step), *theirs.shape[1:]), np.nan))
+                row = np.minimum(np.searchsorted(source.step, table.step), len(source.step) - 1)
+                lacking = np.isnan(mine).all((1, 2)) & (source.step[row] == table.step)
+                mine[lacking] = theirs[row[lacking]]
+
+
+def ends(steps: np.ndarray, tables: dict[str, StageTable], space: Space, labels: tuple[str, ...]) -> dict[str, Array]:
+    """The belief at the end of each step: that of the row with the highest place."""
+    n, d = len(space.names), len(space.axes)
+    shapes: dict[str, tuple[int, ...]] = {"mean": (n,), "cov": (d, d)}
+    if labels:
+        shapes = {"log_probabilities": (len(labels),)}
+    found = {name: np.full((len(steps), *shape), np.nan) for name, shape in shapes.items()}
+    highest = np.full(len(steps), -1)
+    for table in tables.values():
+        at = np.searchsorted(steps, table.step)
+        inside = at < len(steps)  # a killed run may have a stage whose step did not reach the file
+        later = np.zeros(len(at), bool)
+        later[inside] = table.place[inside] > highest[at[inside]]
+        highest[at[later]] = table.place[later]
+        for name, values in found.items():
+            values[at[later]] = table.values[name][later]
+    return found

@@ -1,0 +1,21 @@
+"""Checks of the parameters that a person sets."""
+
+from __future__ import annotations
+
+import math
+
+from viz_estim.errors import BadInput
+
+
+def positive(**values: float | None) -> None:
+    """BadInput where a value that is given is no positive number."""
+    for name, value in values.items():
+        if value is not None and not (value > 0 and math.isfinite(value)):
+            raise BadInput(f"{name} must be a positive number, got {value:g}")
+
+
+def probability(name: str, value: float | None) -> float | None:
+    """The value, where it is none or lies between 0 and 1."""
+    if value is not None and not 0 < value < 1:
+        raise BadInput(f"{name} is a probability between 0 and 1, such as 0.999, got {value:g}")
+    return value
