@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Cli, strict
 from PIL import Image
 
 import viz_estim
 from viz_estim.recording.viewer import Viewer
+from viz_estim.scenarios import SCENARIOS
 
 pytestmark = pytest.mark.draws
 
@@ -39,7 +41,14 @@ def in_front(blueprint: dict[str, Any], item: str = "") -> list[str]:
 
 @pytest.fixture(scope="module")
 def layouts(viewer: Viewer) -> Iterator[list[dict[str, Any]]]:
-    """The view's own blueprint, and the same with other tabs in front, so that each tab is in front in one of them."""
+    """The view's own blueprint, and the same with other tabs in front."""
+    variants = with_each_tab(viewer)
+    yield variants
+    viewer._client.set_blueprint(variants[0], of="recording")
+
+
+def with_each_tab(viewer: Viewer) -> list[dict[str, Any]]:
+    """The view's own blueprint first, and others, so that each tab is in front in one of them."""
     blueprint = viewer._client.get_blueprint().blueprint
     containers = {path: fields.get("ContainerBlueprint", {}) for path, fields in blueprint.items()}
     tabs = {path: c["contents"] for path, c in containers.items() if c.get("container_kind") == "Tabs"}
@@ -48,8 +57,7 @@ def layouts(viewer: Viewer) -> Iterator[list[dict[str, Any]]]:
         variants.append(copy.deepcopy(blueprint))
         for path, contents in tabs.items():
             variants[-1][path]["ContainerBlueprint"]["active_tab"] = contents[min(number, len(contents) - 1)]
-    yield variants
-    viewer._client.set_blueprint(blueprint, of="recording")
+    return variants
 
 
 def picture(viewer: Viewer, view_id: str | None = None) -> np.ndarray:
@@ -67,17 +75,13 @@ def emptiness(view_class: str, pixels: np.ndarray) -> str:
     return "" if colourful >= COLOURFUL else f"{colourful} pixels of any colour"
 
 
-@pytest.mark.parametrize("timeline", ["step", "time", "stage"])
-def test_every_view_draws_and_none_is_empty(
-    timeline: str, viewer: Viewer, layouts: list[dict[str, Any]], recording: Path, tmp_path: Path
-) -> None:
-    run = viz_estim.load(recording)
-    value = {"step": STEP, "time": float(run.time[STEP]), "stage": run.at(STEP)[-1][0].place[STEP]}[timeline]
-    shown = set()
+def assert_all_drawn(viewer: Viewer, layouts: list[dict[str, Any]], timeline: str, value: float, folder: Path) -> None:
+    """At a moment, each view of each tab draws without a complaint, and shows something."""
+    shown: set[str] = set()
     for layout in layouts:
         viewer._client.set_blueprint(layout, of="recording")
         viewer.seek(timeline, value)
-        assert viewer.snapshot(tmp_path / "settled.png")
+        assert viewer.snapshot(folder / "settled.png")
         assert viewer.problems() == []
         front = in_front(layout)
         views = [view for view in viewer._client.get_state().views if view.view_id in front and view.name not in shown]
@@ -88,13 +92,36 @@ def test_every_view_draws_and_none_is_empty(
     assert shown == {name for name, _, _ in viewer.views()}
 
 
+@pytest.mark.parametrize("timeline", ["step", "time", "stage"])
+def test_every_view_draws_and_none_is_empty(
+    timeline: str, viewer: Viewer, layouts: list[dict[str, Any]], recording: Path, tmp_path: Path
+) -> None:
+    run = viz_estim.load(recording)
+    value = {"step": STEP, "time": float(run.time[STEP]), "stage": run.at(STEP)[-1][0].place[STEP]}[timeline]
+    assert_all_drawn(viewer, layouts, timeline, value, tmp_path)
+
+
+@pytest.mark.parametrize("name", [name for name in SCENARIOS if not name.startswith("imu")])
+def test_every_scenario_has_its_view(name: str, cli: Cli, tmp_path: Path) -> None:
+    done = cli("run", name, "--out", tmp_path / "run.rrd", "--json")
+    last = strict(done)["steps"] - 1
+    with Viewer.start(headless=True, size=(1400, 1000)) as viewer:
+        viewer.open(tmp_path / "run.rrd")
+        viewer.seek("step", last)
+        # Half-way through, at a step that has all stages.
+        run = viz_estim.load(tmp_path / "run.rrd", points=False)
+        rarest = min(run.stages.values(), key=lambda table: len(table.step) if table.name != "start" else last + 2)
+        step = int(rarest.step[len(rarest.step) // 2])
+        assert_all_drawn(viewer, with_each_tab(viewer), "step", step, tmp_path)
+
+
 def test_a_stage_shows_its_own_sigma_points_and_no_other_s(
     viewer: Viewer, layouts: list[dict[str, Any]], recording: Path, tmp_path: Path
 ) -> None:
     run = viz_estim.load(recording)
     viewer._client.set_blueprint(layouts[0], of="recording")
     taken = []
-    world = next(v.view_id for v in viewer._client.get_state().views if v.origin == "/world")
+    world = next(v.view_id for v in viewer._client.get_state().views if v.origin == "/attitude")
     sensor = next(v.view_id for v in viewer._client.get_state().views if v.origin == "/sensors/accel")
     for table, row in run.at(STEP):
         viewer.seek("stage", int(table.place[row]))

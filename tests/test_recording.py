@@ -13,12 +13,12 @@ from conftest import SHORT
 from rerun.chunk import RrdReader
 
 import viz_estim
-from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.beliefs import Gaussian, Particles
 from viz_estim.core.measurement import Measurement, Sensor
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario, Step, Tick, run
 from viz_estim.core.spaces import SO3, Euclidean, Product
-from viz_estim.core.stages import Innovation, SigmaPoints, Stage
+from viz_estim.core.stages import Innovation, Matches, Resample, SigmaPoints, Stage
 from viz_estim.core.unscented import predict, symmetric, update
 from viz_estim.parameters import parameters
 from viz_estim.recording.reader import Run
@@ -27,6 +27,8 @@ from viz_estim.running import find, plan
 from viz_estim.scenarios import SCENARIOS
 
 ODD, SHARED = "stages that differ from step to step", "two stages that share a sensor"
+# What stands in a scene through all stages, by its place in the entity's path.
+STANDING = ("estimate", "truth", "scenery", "moved", "particles", "modes", "camera")
 every_scenario = pytest.mark.parametrize("name", [*SCENARIOS, ODD, SHARED])
 Kept = dict[str, tuple[Path, list[Step]]]
 
@@ -120,20 +122,32 @@ def assert_holds(loaded: Run, steps: list[Step], every: int = 1) -> None:
         tables = loaded.at(step.index)
         assert [table.name for table, _ in tables] == [stage.name for stage in step.stages]
         for stage, (table, at) in zip(step.stages, tables, strict=True):
+            thinned = row % every != 0
             held: dict[str, Any] = {name: getattr(stage.belief, name) for name in stage.belief.shapes}
+            if isinstance(stage.belief, Particles):
+                assert table.mean[at] == pytest.approx(stage.belief.mean, abs=1e-9)
+                assert table.cov[at] == pytest.approx(stage.belief.cov, abs=1e-9)
+                held |= {name: table.values[name][at] for name in ("mean", "cov")}
             for field in dataclasses.fields(stage)[2:]:
                 value = getattr(stage, field.name)
                 if isinstance(value, SigmaPoints):
                     missing = np.full(value.points.shape, np.nan)
-                    held[f"{field.name}.points"] = missing if row % every else value.points
+                    held[f"{field.name}.points"] = missing if thinned else value.points
+                elif isinstance(value, Matches):
+                    held |= {f"{field.name}.{part}": getattr(value, part) for part in Matches.__slots__}
                 elif isinstance(value, Innovation):
                     held |= {f"{field.name}.{p}": getattr(value, p) for p in Innovation.__slots__ if p != "space"}
-                elif isinstance(value, np.ndarray):
+                elif isinstance(value, (np.ndarray, float, int)):
                     held[field.name] = value
             assert set(held) == set(table.values)
             assert [key for key, value in held.items() if not same(table.values[key][at], value)] == []
         if step.stages:
-            assert all(same(values[row], getattr(step.stages[-1].belief, k)) for k, values in loaded.ends.items())
+            belief = step.stages[-1].belief
+            for name, values in loaded.ends.items():
+                cloud = isinstance(belief, Particles)
+                assert same(values[row], getattr(belief, name)) or (
+                    cloud and np.allclose(values[row], getattr(belief, name))
+                )
 
 
 @every_scenario
@@ -200,7 +214,7 @@ def assert_geometry(path: Path, steps: list[Step], every: int = 1) -> None:
     """At each moment of each timeline a viewer shows (by an entity's latest row) what that moment's stages drew."""
     rows: dict[tuple[str, str], dict[int, bool]] = defaultdict(dict)
     for entity, times, lengths in rows_of(path):
-        still = entity.split("/")[2:3] in (["estimate"], ["truth"], ["scenery"])
+        still = any(entity.split("/")[2:3] == [name] for name in STANDING)
         if entity.startswith(("/sensors/", "/world/", "/attitude/")) and not still:
             for timeline, value in times.items():
                 assert value not in rows[entity, timeline], f"{entity}: rows at {timeline} {value} hide each other"
@@ -211,7 +225,7 @@ def assert_geometry(path: Path, steps: list[Step], every: int = 1) -> None:
         kept = step.index % every == 0
         shown = []
         for stage in step.stages:
-            shown.append(owned(stage, before, drew) if kept else set())
+            shown.append(owned(stage, before, drew, step.index) if kept else set())
             before, drew = stage, kept
         shown = shown or [set()]
         moments["step"].append((step.index, set().union(*shown)))
@@ -232,16 +246,20 @@ def leaves(space: Any) -> Iterator[tuple[str, Any]]:
         yield from leaves(part) if isinstance(part, Product) else [(name, part)]
 
 
-def owned(stage: Stage, before: Stage | None, drew: bool) -> set[str]:
+def owned(stage: Stage, before: Stage | None, drew: bool, index: int) -> set[str]:
     """The geometry that stands during a stage: sigma points of places and attitudes, readings of sensors in scenes of
     their own, and where the state has a place, what the update moved there. Points that are the stage before's own
     stand on from there."""
     paths: set[str] = set()
-    parts = getattr(stage.belief, "space", Product()).parts
+    parts = getattr(getattr(stage.belief, "space", None), "parts", {})
     places = {k for k, part in parts.items() if part.names in (("x", "y"), ("x", "y", "z")) and part.units[0] == "m"}
+    if isinstance(stage, Resample) and index > 0:
+        paths.add(f"/world/{stage.name}/ancestry")
     for field in dataclasses.fields(stage)[2:]:
         value = getattr(stage, field.name)
-        if isinstance(value, Innovation):
+        if isinstance(value, Matches):
+            paths.add(f"/world/{stage.name}/{field.name}")
+        elif isinstance(value, Innovation):
             for sensor, part in value.space.parts.items():
                 reads = next(iter(getattr(part, "parts", {sensor: part}).values()))
                 if places and part.units[0] == "m" and (reads.names in (("x", "y"), ("x", "y", "z")) or before):

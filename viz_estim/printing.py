@@ -201,7 +201,7 @@ def step_text(run: Run, value: dict[str, Any]) -> str:
                 along = name.endswith("residual")
                 names, units = (space.axes, space.axis_units) if along else (space.names, space.units)
                 lines.append(f"  {name:18} {_named(names, numbers, units)}")
-            elif numbers.ndim == 1:
+            elif numbers.size <= 20 and numbers.ndim < 2:
                 lines.append(f"  {name:18} {_row(numbers)}")
             else:
                 lines.append(f"  {name:18} {'×'.join(map(str, numbers.shape))} (see --json)")

@@ -16,7 +16,7 @@ _ROUNDS = 30
 _REACH = 5.0  # σ either way: a mode of weight p lies at most 1/√p away
 _SMOOTH = 2.0  # cells to a kernel's σ
 _TRUSTED = 100.0  # after a resampling the ESS counts copies: no finer a kernel than for so many draws
-_VALLEY = 0.5  # of the lower peak: what separates two modes is at most as dense
+_VALLEY = 0.7  # of the lower peak: peaks that the density between them does not fall below are one mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,16 +34,17 @@ def moments(space: Space, states: Array, log_weights: Array) -> tuple[Array, Arr
     The fixed point m = m ⊞ Σ wᵢ (xᵢ ⊟ m), started at the heaviest particle (Pennec 1998). Angles spread all around have
     none; theirs is where the iteration stands when it is given up, and their covariance says how little that means.
     """
+    states = np.asfortranarray(states)  # each column in one piece: numpy is fast along long axes
     weights = np.exp(log_weights)[..., None, :]
     heaviest = log_weights.argmax(-1)[..., None, None]
     mean = np.take_along_axis(states, heaviest, axis=-2)
     settled = max(1e-10, 64 * np.finfo(float).eps * float(np.abs(states).max()))
     for _ in range(_ROUNDS):
-        step = weights @ space.minus(states, mean)
+        error = space.minus(states, mean)
+        step = weights @ error
         mean = space.plus(mean, step)
         if np.abs(step).max() < settled:
             break
-    error = space.minus(states, mean)
     cov = (np.swapaxes(error, -1, -2) * weights) @ error
     return mean[..., 0, :], 0.5 * (cov + np.swapaxes(cov, -1, -2))
 
@@ -53,7 +54,7 @@ def modes(space: Space, states: Array, log_weights: Array, least: float = 0.05) 
 
     Of the density over the components in metres (over the changes from the mean, where there are none; the first three
     of either), a histogram smoothed with Silverman's width (1986, eq. 4.14): each cell climbs to its peak, and peaks
-    without a valley between them are one mode. Clouds that differ in heading alone are one mode.
+    without a valley between them are one mode. So are clouds that differ in heading alone.
     """
     weights = np.exp(log_weights)
     metres = [i for i, unit in enumerate(space.units) if unit == "m"]

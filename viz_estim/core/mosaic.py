@@ -37,11 +37,17 @@ class Mosaic:
 
 @dataclass(frozen=True, slots=True)
 class Paint(Stage):
-    """A picture, by its number, painted on the canvas where it lay: angles (3,) are roll, pitch and yaw in rad,
-    R = Rz(yaw)·Ry(pitch)·Rx(roll)."""
+    """A picture painted on the canvas where it lay.
 
-    picture: int
+    picture (2,): its number, and its stamp in s; angles (3,): its roll, pitch and yaw in rad, where
+    R = Rz(yaw)·Ry(pitch)·Rx(roll).
+    mismatch: its root mean squared difference, in colours from 0 to 255, from what earlier pictures left there; 0 where
+    there were none. It tells of a wrong attitude without any truth.
+    """
+
+    picture: Array
     angles: Array
+    mismatch: float
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,6 @@ class Painter:
             late = 0.0 if tick.dt == 0 else min(1.0, (tick.time - stamp) / tick.dt)
             back = late * belief.space.minus(before.mean, belief.mean)
             q = belief.space.plus(belief.mean, back)[belief.space.at["attitude"]]
-            tiles = paint(belief.tiles, self.camera.pictures[int(number)], q, self.camera.field_of_view)
+            tiles, mismatch = paint(belief.tiles, self.camera.pictures[int(number)], q, self.camera.field_of_view)
             painted = Mosaic(belief.space, belief.mean, belief.cov, tiles)
-            yield Paint("paint", painted, int(number), quaternions.to_euler(q))
+            yield Paint("paint", painted, tick.measurements["picture"], quaternions.to_euler(q), mismatch)

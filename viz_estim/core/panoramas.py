@@ -82,8 +82,9 @@ def blank() -> Tiles:
     return (nothing,) * len(_grid().centres)
 
 
-def paint(tiles: Tiles, picture: Picture, q: Array, field_of_view: tuple[float, float]) -> Tiles:
-    """The canvas with a picture (M, N, 3) added, taken at attitude q (4,), body → world.
+def paint(tiles: Tiles, picture: Picture, q: Array, field_of_view: tuple[float, float]) -> tuple[Tiles, float]:
+    """The canvas with a picture (M, N, 3) added, taken at attitude q (4,), body → world; and how ill the picture fits:
+    the root mean squared difference from what was there, weighted as it is painted, 0 where nothing was.
 
     Each pixel of the canvas looks into the picture, bilinear. Weights fall from 1 at the picture's middle to 0 at its
     border, so that no seam is seen (Szeliski 2006, section 6.2). Tiles that it does not reach are shared with the old.
@@ -100,12 +101,17 @@ def paint(tiles: Tiles, picture: Picture, q: Array, field_of_view: tuple[float, 
     rows, columns = picture.shape[:2]
     at = np.stack([0.5 * (down + 1) * rows - 0.5, 0.5 * (across + 1) * columns - 0.5], axis=-1)
     weight = ((1 - np.abs(across)) * (1 - np.abs(down)))[:, None]
+    colours = sample(picture, at)
+    there = np.stack([tiles[i] for i in near])[inside]
+    common = weight * (there[:, 3:] > 0)
+    squared = (colours - there[:, :3] / np.maximum(there[:, 3:], 1e-9)) ** 2
+    mismatch = float(np.sqrt((common * squared).sum() / (3 * max(common.sum(), 1e-9))))
     added = np.zeros((*inside.shape, 4), np.float32)
-    added[inside] = np.concatenate([weight * sample(picture, at), weight], axis=1)
+    added[inside] = np.concatenate([weight * colours, weight], axis=1)
     painted = list(tiles)
     for i in np.flatnonzero(inside.any((1, 2))):
         painted[near[i]] = tiles[near[i]] + added[i]
-    return tuple(painted)
+    return tuple(painted), mismatch
 
 
 def unrolled(tiles: Tiles) -> tuple[Picture, NDArray[np.bool_]]:

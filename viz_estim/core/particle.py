@@ -53,7 +53,7 @@ def weigh(belief: Particles, log_likelihood: LogLikelihood, tick: Tick, *, name:
     total = weights.sum(axis=-1)
     evidence = best[..., 0] + np.log(total)
     log_weights -= evidence[..., None]
-    ess = total**2 / (weights[..., None, :] @ weights[..., :, None])[..., 0, 0]
+    ess = total**2 / np.square(weights).sum(axis=-1)
     after = Particles(belief.space, belief.states, log_weights)
     return Weigh(name, after, log_likelihoods, np.asarray(evidence), np.asarray(ess))
 
@@ -72,6 +72,7 @@ def resample(
     where (*,): the members of a batch that are resampled; the others stay as they are, each its own ancestor.
     """
     weights = np.exp(belief.log_weights)
+    ess = np.asarray(1 / np.square(weights).sum(axis=-1))
     copies = METHODS[method](weights, rng)
     N, n = belief.states.shape[-2:]
     log_weights = np.full(weights.shape, -np.log(N))
@@ -81,8 +82,8 @@ def resample(
     chosen = np.repeat(np.arange(copies.size), copies.ravel())
     states = belief.states.reshape(-1, n).take(chosen, axis=0).reshape(belief.states.shape)
     ancestors = (chosen if copies.ndim == 1 else chosen % N).reshape(copies.shape)
-    distinct = np.asarray(np.count_nonzero(copies, axis=-1), float)
-    return Resample(name, Particles(belief.space, states, log_weights), ancestors, distinct, np.asarray(belief.ess))
+    distinct = np.asarray((copies > 0).sum(axis=-1), float)
+    return Resample(name, Particles(belief.space, states, log_weights), ancestors, distinct, ess)
 
 
 @dataclass(frozen=True)

@@ -81,10 +81,13 @@ def fit(x: Array, y: Array) -> Fit:
     """
     x_mean, x = _centred(x)
     y_mean, y = _centred(y)
-    U, sizes, Vt = np.linalg.svd(transposed(x) @ y)
+    H = transposed(x) @ y
+    U, sizes, Vt = np.linalg.svd(H)
     sign = np.copysign(1.0, np.linalg.det(U) * np.linalg.det(Vt))
     if (sizes[..., -2] + sign * sizes[..., -1] <= _DEGENERATE * sizes[..., 0]).any():
-        raise ArithmeticError("the matches do not determine a rotation: they lie at one place or on one line")
+        raise ArithmeticError(
+            "the matches do not determine a rotation: they lie at one place, on one line, or mirror each other"
+        )
     Vt[..., -1, :] *= sign[..., None]
     R = transposed(U @ Vt)
     residual = y - x @ transposed(R)

@@ -111,13 +111,16 @@ class Chance:
         return self._generator
 
 
-def run(scenario: Scenario, seed: int = 0) -> Iterator[Step]:
-    """The scenario's steps, one a tick, or fewer: the last one carries a failure where the estimator raised one."""
-    belief: Belief | None = None
+def run(scenario: Scenario, seed: int = 0, *, first: int = 0, belief: Belief | None = None) -> Iterator[Step]:
+    """The scenario's steps, one a tick, or fewer: the last one carries a failure where the estimator raised one.
+
+    first, belief: to begin with that step, given what was believed before it; the steps are then those of the whole run.
+    """
     chance = Chance(seed)
     # A person's own kind of belief may lack them: then its first stage says so.
     shapes: Mapping[str, tuple[int, ...]] = getattr(scenario.beliefs[0], "shapes", {})
-    for k, tick in enumerate(scenario.ticks):
+    for k in range(first, len(scenario.ticks)):
+        tick = scenario.ticks[k]
         stages: list[Stage] = []
         error = None
         if k in scenario.beliefs:

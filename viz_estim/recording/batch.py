@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from viz_estim.core.beliefs import Belief
+from viz_estim.core.beliefs import Belief, Particles
+from viz_estim.core.modes import moments
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Step
 from viz_estim.core.stages import Stage
@@ -55,12 +56,8 @@ class StageRows:
 
     def shared(self, field: str, earlier: str) -> np.ndarray:
         """Which rows hold in a field the very object that the stage before holds in its field `earlier`."""
-        return np.array(
-            [
-                getattr(before, earlier, None) is mine
-                for mine, before in zip(self.objects(field), self.before, strict=True)
-            ]
-        )
+        theirs = [_read(before, earlier) for before in self.before]
+        return np.array([mine is one for mine, one in zip(self.objects(field), theirs, strict=True)])
 
 
 class Batch:
@@ -134,6 +131,20 @@ class Batch:
         return (parts[0] if len(parts) == 1 else np.concatenate(parts))[self._order]
 
     @cached_property
+    def end_moments(self) -> tuple[Array, Array]:
+        """Mean (N, n) and covariance (N, d, d) at the end of each step; of clouds, many at once."""
+        ended = [self.steps[row].stages[-1].belief for row in self.end_rows.tolist()]
+        if ended and isinstance(ended[0], Particles):
+            space, size = ended[0].space, max(1, 50_000 // len(ended[0].log_weights))
+            groups = [ended[i : i + size] for i in range(0, len(ended), size)]
+            found = [
+                moments(space, np.stack([b.states for b in group]), np.stack([b.log_weights for b in group]))
+                for group in groups
+            ]
+            return np.concatenate([mean for mean, _ in found]), np.concatenate([cov for _, cov in found])
+        return self.beliefs("mean")[self.ends], self.beliefs("cov")[self.ends]
+
+    @cached_property
     def truth(self) -> Array:
         """The truth (N, n), NaN where there is none; of a run that has one."""
         size = next((len(step.truth) for step in self.steps if step.truth is not None), 0)
@@ -142,6 +153,14 @@ class Batch:
 
 
 _TIMELINES = ("step", "time", "stage")
+
+
+def _read(stage: Stage | None, path: str) -> Any:
+    """A quantity of a stage by its path; None where it has none."""
+    value: Any = stage
+    for name in path.split("."):
+        value = getattr(value, name, None)
+    return value
 
 
 def _stacked(found: list[Any]) -> Any:

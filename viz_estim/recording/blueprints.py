@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import rerun.blueprint as rrb
 
 from viz_estim.core.consistency import band
-from viz_estim.core.spaces import SO3, Space
-from viz_estim.recording import schema
+from viz_estim.core.spaces import Space
+from viz_estim.recording import pictures, schema
 from viz_estim.recording.layout import Layout
 from viz_estim.recording.scenes import own_scene
 
@@ -20,12 +20,16 @@ _MANY = 5  # rows of plots that one tab holds
 def build(layout: Layout) -> rrb.Blueprint:
     """Scenes at the left, plots in tabs at the right, lanes and notes below."""
     scenes = _scenes(layout)
+    figures = _figures(layout)
     tabs = [_probabilities()] if layout.labels else [*_health(layout), _state(layout), *_moved(layout)]
+    tabs = [*figures, *tabs] if figures and not layout.true_parts else [*tabs[:1], *figures, *tabs[1:]]
     plots = rrb.Tabs(*tabs, name="plots", active_tab=0)
     lanes = rrb.StateTimelineView(origin=schema.LANES, name="Lanes: stage, and what became of each sensor's reading")
     notes = rrb.TextDocumentView(origin=schema.NOTES, name="What to look at")
     left: list[_Item] = [*scenes, notes]
     shares: list[float] = {1: [1.0], 2: [3.0, 1.0], 3: [3.0, 2.0, 1.6]}[len(left)]
+    if layout.camera:
+        shares = [2.3, 2.4, 1.6]  # the unrolled sphere is twice as wide as high
     low = min(0.4, 0.054 + 0.044 * (len(layout.inputs) + 1 + bool(layout.labels)))  # a lane is some 37 pixels high
     whole = rrb.Horizontal(
         rrb.Vertical(*left, row_shares=shares),
@@ -57,9 +61,14 @@ def _scenes(layout: Layout) -> list[_Item]:
         ))  # fmt: skip
     if layout.position:
         kind = "Plan from above" if layout.planar else "World"
-        first.append(_world(layout, f"{kind} [m]: estimate amber with 3σ{truth}, before the update grey"))
-    second: list[_Item] = []
-    if any(isinstance(part, SO3) for part in layout.space.parts.values()):
+        title = f"estimate amber with 3σ{truth}, before the update grey"
+        if layout.particles:
+            title = f"particles blue (light) to amber (heavy){truth}"
+        elif layout.matched:
+            title = "moved cloud amber, fixed grey, pairs blue (near) to red (far)"
+        first.append(_world(layout, f"{kind} [m]: {title}"))
+    second: list[_Item] = [*pictures.views(layout)]
+    if layout.attitude and not layout.matched:
         title = f"Attitude: estimate amber{truth}{', sigma points on the sphere' if points else ''}"
         (second if layout.position else first).append(_scene(schema.ATTITUDE, title, 1.0))
     for name, space in layout.sensors.items():
@@ -79,7 +88,7 @@ def _world(layout: Layout, name: str) -> rrb.Spatial3DView:
     if layout.planar:
         eye = rrb.EyeControls3D(position=[x, y, 2.9 * reach], look_target=[x, y, 0], eye_up=[0, 1, 0], kind="Orbital")
     else:
-        place = [x + 1.7 * reach, y - 2.0 * reach, z + 1.3 * reach]
+        place = [x + 1.3 * reach, y - 1.6 * reach, z + 1.1 * reach]
         eye = rrb.EyeControls3D(position=place, look_target=[x, y, z], eye_up=[0, 0, 1], kind="Orbital")
     start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     since = [rrb.VisibleTimeRange(timeline, start=start, end=now) for timeline in ("step", "time", "stage")]
@@ -134,6 +143,17 @@ def _health(layout: Layout) -> list[_Item]:
         return [rrb.Vertical(*innovations, name="Innovations"), rrb.Vertical(*errors, name="Errors")]
     rows = [*errors, *innovations] or _sigmas(layout)
     return [rrb.Vertical(*rows, name="Consistency")]
+
+
+def _figures(layout: Layout) -> list[_Item]:
+    """The single numbers of stages, over time."""
+    views = [
+        _plot("figure", f"{stage}.{field}", f"{stage}: {field}")
+        for stage, fields in layout.stages.items()
+        for field, what in fields.items()
+        if what.get("shape") == []
+    ]
+    return [rrb.Vertical(*_rows(views, [1] * len(views)), name="Figures")] if views else []
 
 
 def _state(layout: Layout) -> rrb.Container:

@@ -52,13 +52,17 @@ class Bodies:
             self._draw_scenery(scenario)
 
     def add(self, batch: Batch) -> None:
-        if not batch.stages or not self._layout.space.parts:
-            return
-        self._draw("estimate", batch.at, batch.beliefs("mean"), schema.ESTIMATE)
+        if not batch.stages or not self._layout.space.parts or self._layout.matched:
+            return  # the cloud that moves shows the pose
+        # After each stage; the mean of a cloud at the end of each step alone: the cloud itself shows the rest.
+        cloud = bool(self._layout.particles)
+        at = batch.at.pick(batch.ends) if cloud else batch.at
+        mean, cov = batch.end_moments if cloud else (batch.beliefs("mean"), batch.beliefs("cov"))
+        self._draw("estimate", at, mean, schema.ESTIMATE)
         if self._layout.position:
-            self._measure_ellipses(batch)
+            self._measure_ellipses(at, mean, cov)
             now = self._ellipses.pick(slice(1, None))
-            self._draw_ellipses(f"{schema.WORLD}/estimate/cov", batch.at, now, schema.ESTIMATE)
+            self._draw_ellipses(f"{schema.WORLD}/estimate/cov", at, now, schema.ESTIMATE)
         if self._layout.true_parts:
             self._draw("truth", batch.times, batch.truth, schema.TRUTH)
 
@@ -122,15 +126,15 @@ class Bodies:
         assert self._places is not None
         self._draw_ellipses(path, at, self._ellipses.pick(np.searchsorted(self._places, at.stage)), schema.BAND)
 
-    def _measure_ellipses(self, batch: Batch) -> None:
+    def _measure_ellipses(self, at: Times, mean: Array, cov: Array) -> None:
         """The 3σ ellipsoids of the position after each stage, turned into the world where the covariance is along the
         body's axes; with that of the stage before the batch in front."""
         layout = self._layout
         assert layout.position
         part = layout.space.parts[layout.position]
         where = layout.space.axes_at[layout.position]
-        block = batch.beliefs("cov")[:, where, where]
-        state = batch.beliefs("mean")[:, layout.space.at[layout.position]]
+        block = cov[:, where, where]
+        state = mean[:, layout.space.at[layout.position]]
         if isinstance(part, SE2):
             c, s = np.cos(state[:, 2]), np.sin(state[:, 2])
             R = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
@@ -140,7 +144,7 @@ class Bodies:
         now = _Ellipsoids(flat3(place_of(part, state)), 3 * sizes, xyzw(turns), known)
         before = (now if self._places is None else self._ellipses).pick(slice(-1, None))
         self._ellipses = _Ellipsoids(*(np.concatenate(pair) for pair in zip(before, now, strict=True)))
-        self._places = batch.at.stage
+        self._places = at.stage
 
     def _draw_ellipses(self, path: str, at: Times, drawn_ones: _Ellipsoids, colour: schema.Colour) -> None:
         self._style(path, rr.Ellipsoids3D.from_fields(colors=[colour], line_radii=[_LINE], fill_mode="MajorWireframe"))

@@ -86,7 +86,9 @@ def once(archetype: str, component: str, value: Array, rows: int) -> rr.Componen
 @cache
 def _kind(archetype: Any, component: str) -> tuple[rr.ComponentDescriptor, pa.DataType]:
     """A component's descriptor and arrow type, learnt from a column that Rerun makes of one value."""
-    one = [1.0] if component in ("values", "variances") else [[1.0] * (4 if component == "quaternions" else 3)]
+    one: list[Any] = [[1.0] * (4 if component.startswith("quaternion") else 3)]
+    if component in ("values", "variances", "colors"):
+        one = [0xFFFFFFFF] if component == "colors" else [1.0]
     (column,) = archetype.columns(**{component: one})
     return column.descriptor, column.component_batch.as_arrow_array().type
 
@@ -102,7 +104,7 @@ def drawn(archetype: Any, counts: int | np.ndarray, rows: int, **components: Arr
             flat = pa.array(np.asarray(values, np.float32).ravel())
             batch = pa.FixedSizeListArray.from_arrays(flat, type=kind)
         else:
-            batch = pa.array(np.asarray(values, float).ravel())
+            batch = pa.array(np.asarray(values, kind.to_pandas_dtype()).ravel())
         columns.append(rr.ComponentColumn(descriptor, _Batch(batch), offsets=offsets))
     return columns
 

@@ -12,13 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from viz_estim.core.beliefs import Particles
 from viz_estim.core.descriptions import describe
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario
-from viz_estim.core.scenery import Landmarks, Path
+from viz_estim.core.scenery import Camera, Cloud, Landmarks, Path
 from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product, Space
-from viz_estim.core.stages import Innovation, SigmaPoints
+from viz_estim.core.stages import Innovation, Matches, SigmaPoints
 from viz_estim.recording.batch import Batch, StageRows
+
+KEPT = 4000  # particles of a cloud at most: more are thinned by weight
 
 
 class Layout:
@@ -27,7 +30,8 @@ class Layout:
     stages: per stage the shape (as JSON: a list) or the space of each field; sensors: the spaces of those that
     innovations came from; reach: about how long their readings are; silent: by sensor the steps at which a reading was
     due and none came; true_parts: the parts of the state that have a truth; gapless: those of them that have it at
-    every step. position, heading, attitude: the parts that say where and how the body is, if any.
+    every step; particles: how many the belief has; matched: clouds are matched, a registration. position, heading,
+    attitude: the parts that say where and how the body is, if any.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -42,8 +46,12 @@ class Layout:
         self.heading = next((name for name, part in parts if isinstance(part, (SO2, SE2))), None)
         self.attitude = next((name for name, part in parts if isinstance(part, SO3)), None)
         self.scenery = scenario.scenery
+        self.matched = any(isinstance(thing, Cloud) and thing.moves for thing in scenario.scenery.values())
+        self.camera = next((thing for thing in self.scenery.values() if isinstance(thing, Camera)), None)
         self.extent = self._extent(scenario, truth) if self.position else None
         self.silent = _silences(scenario)
+        first = scenario.beliefs[0]
+        self.particles = len(first.log_weights) if isinstance(first, Particles) else 0
         self.stages: dict[str, dict[str, Any]] = {}
         self.inputs: list[str] = []
         self.sensors: dict[str, Space] = {}
@@ -58,10 +66,13 @@ class Layout:
         """The centre (3,) and the half width in m of what is known to be in the scene."""
         assert self.position
         part, at = self.space.parts[self.position], self.space.at[self.position]
-        seen = [place_of(part, x[self.space.at[self.position]])[None] for x in (scenario.beliefs[0].mean,)]
+        first = scenario.beliefs[0]
+        start = first.states if isinstance(first, Particles) else first.mean[None]
+        seen = [place_of(part, start[:, at])]
         if self.position in self.true_parts:
             seen.append(place_of(part, truth[np.isfinite(truth[:, at]).all(1), at]))
         seen += [thing.positions for thing in scenario.scenery.values() if isinstance(thing, (Landmarks, Path))]
+        seen += [thing.points for thing in scenario.scenery.values() if isinstance(thing, Cloud)]
         points = np.concatenate([flat3(np.asarray(place, float)) for place in seen])
         low, high = points.min(0), points.max(0)
         return 0.5 * (low + high), max(0.5, float(0.5 * np.abs(high - low).max()))
@@ -73,6 +84,11 @@ class Layout:
             if rows.name not in self.stages:
                 self._learn(rows)
                 new = True
+            if self.particles and "belief.states" not in self.stages[rows.name] and len(rows.stages) > 1:
+                before = rows.before[-1]
+                if before is not None and before.belief.states is rows.stages[-1].belief.states:
+                    self.stages[rows.name]["belief.states"] = {"same_as": [before.name, "belief.states"]}
+                    new = True
             new |= self._learn_sources(rows)
         seen: dict[str, None] = dict.fromkeys(self.inputs)
         for step in batch.steps:
@@ -95,8 +111,12 @@ class Layout:
                 for name, at in value.space.at.items():
                     size = float(np.linalg.norm(value.z[at]))
                     self.reach[name] = size if size > 0.1 else 1.0
+            elif isinstance(value, Matches):
+                fields[field.name] = {"matches": value.source.shape[-1]}
             elif isinstance(value, (np.ndarray, float, int)):
-                fields[field.name] = {"shape": list(np.shape(value))}
+                shape = list(np.shape(value))
+                cloud = bool(self.particles) and shape[:1] == [min(self.particles, KEPT)]
+                fields[field.name] = {"shape": shape} | ({"cloud": True} if cloud else {})
             elif isinstance(value, tuple) and all(isinstance(one, str) for one in value):
                 fields[field.name] = {"names": list(value)}
         self.stages[rows.name] = fields
@@ -119,7 +139,10 @@ class Layout:
         return [*self.inputs, *(name for name in self.sensors if name not in self.inputs)].index(sensor)
 
     def as_json(self) -> dict[str, Any]:
-        return {"stages": self.stages, "inputs": self.inputs}
+        found: dict[str, Any] = {"stages": self.stages, "inputs": self.inputs}
+        return found | (
+            {"particles": {"count": self.particles, "kept": min(self.particles, KEPT)}} if self.particles else {}
+        )
 
 
 def _silences(scenario: Scenario) -> dict[str, set[int]]:

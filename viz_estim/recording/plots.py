@@ -36,6 +36,7 @@ class Plots:
             else:
                 self._draw_states(batch)
             self._lane("stage", batch.at, list(chain.from_iterable(batch.names)))
+        self._draw_figures(batch)
         gated = self._innovations.add(batch)
         for sensor in self._layout.inputs:
             refused = gated.get(sensor, set())
@@ -47,7 +48,7 @@ class Plots:
     def _draw_states(self, batch: Batch) -> None:
         """The belief at the end of each step, by part: its components, its σ, its error."""
         at, row = batch.at.pick(batch.ends), batch.end_rows
-        mean, cov = batch.beliefs("mean")[batch.ends], batch.beliefs("cov")[batch.ends]
+        mean, cov = batch.end_moments
         variance = np.diagonal(cov, axis1=1, axis2=2)
         truth = batch.truth[row] if self._layout.true_parts else np.broadcast_to(np.nan, mean.shape)
         space = self._layout.space
@@ -97,6 +98,14 @@ class Plots:
                 nothing = np.full(len(part.names), np.nan)
                 return name, np.array([step.tick.measurements.get(name, nothing) for step in steps])
         return None
+
+    def _draw_figures(self, batch: Batch) -> None:
+        """The single numbers of stages, such as the effective sample size, or the RMSE of a fit."""
+        for rows in batch.stages:
+            for field, what in self._layout.stages[rows.name].items():
+                if what.get("shape") == []:
+                    line = (field, schema.ESTIMATE, rows.array(field))
+                    self._lines.broken(schema.plot("figure", f"{rows.name}.{field}"), rows.at, "", line)
 
     def _draw_probabilities(self, batch: Batch) -> None:
         """The probability of each label after each step as lines, after each stage as bars; the true label's beside."""

@@ -21,7 +21,7 @@ from viz_estim.core.spaces import Product, Space
 from viz_estim.errors import BadInput
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.rescue import whole
-from viz_estim.recording.tables import Gathered, StageTable, ends, fill_in, table_of
+from viz_estim.recording.tables import Gathered, StageTable, ends, fill_in, table_of, work_out
 
 
 class NotARun(BadInput):
@@ -151,8 +151,11 @@ def load(path: str | Path, *, points: bool = True) -> Run:
         truth = steps.column("truth.label", (1,))
     fields = facts.get("stages", {})
     known = [*(name for name in fields if name in stages), *(name for name in stages if name not in fields)]
-    tables = {name: table_of(name, stages[name], space, fields.get(name, {})) for name in known}
+    kept = int(facts.get("particles", {}).get("kept", 0))
+    tables = {name: table_of(name, stages[name], space, fields.get(name, {}), kept) for name in known}
     fill_in(tables, fields)
+    if kept:
+        work_out(tables, space)
     return Run(
         path, facts, space, labels, index["step"], index["time"], steps.column("dt", ()), truth, inputs, tables,
         ends(index["step"], tables, space, labels), error, "result" in facts,

@@ -16,14 +16,19 @@ import rerun as rr
 
 from viz_estim.core.descriptions import describe
 from viz_estim.core.run import Scenario, Step
-from viz_estim.core.stages import Innovation, Stage
+from viz_estim.core.stages import Stage
 from viz_estim.recording import blueprints, schema
-from viz_estim.recording.batch import Batch, StageRows, belief_fields
+from viz_estim.recording.batch import Batch
 from viz_estim.recording.bodies import Bodies
-from viz_estim.recording.columns import Times, numbers, once, send_static
+from viz_estim.recording.clouds import Clouds
+from viz_estim.recording.columns import Times, numbers, send_static
 from viz_estim.recording.layout import Layout
+from viz_estim.recording.pictures import Pictures
 from viz_estim.recording.plots import Plots
+from viz_estim.recording.registration import Registration
 from viz_estim.recording.scenes import Scenes
+from viz_estim.recording.stage_columns import stage_columns
+from viz_estim.recording.standing import Standing
 
 # A batch is cut by rows and bytes, which the same seed repeats; by time only where steps are so slow that a kill would
 # lose a second of them, or while a viewer watches.
@@ -31,7 +36,6 @@ _ROWS = 1000
 _BYTES = 8 << 20
 _SECONDS = 0.6
 _SECONDS_WATCHED = 0.05
-_STAGE = "viz_estim.Stage"
 
 
 class Recorder:
@@ -69,8 +73,15 @@ class Recorder:
         self._stream.send_recording_name(str(properties.get("title", name)))
         self._stream.flush()  # what is logged so far comes before all columns
         self._bodies = Bodies(self._stream, self._layout, scenario)
-        self._scenes = Scenes(self._stream, self._layout, self._bodies, every)
+        self._standing = Standing(self._stream, every)
+        self._scenes = Scenes(self._stream, self._layout, self._bodies, self._standing, every)
+        self._registration = Registration(self._stream, self._layout, self._standing, every)
+        count = len(scenario.ticks)
+        self._clouds = (
+            Clouds(self._stream, self._layout, self._standing, every, count) if self._layout.particles else None
+        )
         self._plots = Plots(self._stream, self._layout)
+        self._pictures = Pictures(self._stream, self._layout, every)
         belief = scenario.beliefs[0]
         kind: dict[str, Any] = {"belief": type(belief).__name__, "facts": dict(scenario.facts)}
         kind |= {"labels": list(belief.labels)} if self._layout.labels else {"space": describe(scenario.space)}
@@ -88,6 +99,8 @@ class Recorder:
         if self._failed:
             raise self._failed
         with self._lock:
+            if self._clouds:
+                step = self._clouds.take(step)
             if not self._rows:
                 self._oldest = time.monotonic()
             self._rows.append(step)
@@ -159,10 +172,15 @@ class Recorder:
         new = self._layout.learn(batch)
         self._send_steps(batch)
         for rows in batch.stages:
-            self._send_stage(rows)
+            self._send(schema.stage(rows.name), rows.at, stage_columns(self._layout, batch, rows, self._every))
         self._bodies.add(batch)
         self._scenes.add(batch)
+        self._registration.add(batch)
+        if self._clouds:
+            self._clouds.add(batch)
+        self._standing.clear(batch)
         self._plots.add(batch)
+        self._pictures.add(batch)
         if new:
             self._send_properties()
         if self._viewed != (known := [*self._layout.sensors, *self._layout.stages]):  # the view is built from these
@@ -200,35 +218,6 @@ class Recorder:
             if any(row is not None for row in rows)
         ]
         self._send(schema.STEPS, batch.times, columns)
-
-    def _send_stage(self, rows: StageRows) -> None:
-        columns = [self._column(rows, f"belief.{name}", name) for name in belief_fields(rows.stages[0].belief)]
-        kept = rows.at.step % self._every == 0
-        for field, what in self._layout.stages[rows.name].items():
-            if "points" in what:
-                mine = kept & ~rows.shared(field, what["same_as"][1]) if "same_as" in what else kept
-                if mine.all():
-                    columns.append(self._column(rows, f"{field}.points"))
-                elif mine.any():
-                    points = rows.objects(f"{field}.points")
-                    columns.append(
-                        numbers(
-                            _STAGE, f"{field}.points", [p if k else None for p, k in zip(points, mine, strict=True)]
-                        )
-                    )
-            elif "innovation" in what:
-                parts = [part for part in Innovation.__slots__ if part != "space"]
-                columns += [self._column(rows, f"{field}.{part}") for part in parts]
-            elif "shape" in what:
-                columns.append(self._column(rows, field))
-        self._send(schema.stage(rows.name), rows.at, columns)
-
-    def _column(self, rows: StageRows, path: str, name: str | None = None) -> rr.ComponentColumn:
-        """A quantity of the stage; once, where all rows hold the same object (a constant noise, say)."""
-        found = rows.objects(path)
-        if len(found) > 1 and found[0] is found[-1] and all(value is found[0] for value in found):
-            return once(_STAGE, name or path, found[0], len(found))
-        return numbers(_STAGE, name or path, rows.values(path))
 
 
 def partial_of(path: Path) -> Path:

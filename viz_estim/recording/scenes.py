@@ -22,9 +22,11 @@ from viz_estim.recording.standing import Standing
 class Scenes:
     """Draws batches into the spatial views of a stream."""
 
-    def __init__(self, stream: rr.RecordingStream, layout: Layout, bodies: Bodies, every: int) -> None:
+    def __init__(
+        self, stream: rr.RecordingStream, layout: Layout, bodies: Bodies, standing: Standing, every: int
+    ) -> None:
         self._stream, self._layout, self._bodies, self._every = stream, layout, bodies, every
-        self._standing = Standing(stream, every)
+        self._standing = standing
         self._spheres: set[str] = set()
         self._drew: dict[tuple[str, str], bool] = {}  # by stage and field of points: whether it last drew its own
         landmarks = [thing for thing in layout.scenery.values() if isinstance(thing, Landmarks)]
@@ -46,7 +48,6 @@ class Scenes:
                         self._draw_readings(rows, field, at, kept)
                         if self._layout.position and rows.has_prior.all():
                             self._draw_moved(rows, field, at, kept)
-        self._standing.clear(batch)
 
     def _draw_points(self, rows: StageRows, field: str, at: Times, kept: np.ndarray, same_as: Any) -> None:
         """Sigma points: places in the world, an attitude's as tips of the body's axes on the sphere, a sensor's in its

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 Colour = tuple[int, int, int]
 
 # One meaning a colour, in every view.
@@ -21,6 +23,7 @@ SENSORS: dict[str, Colour] = {
 }
 BAND: Colour = (120, 120, 130)
 SCENERY: Colour = (150, 150, 160)
+MODE: Colour = (255, 255, 150)
 AXES: tuple[Colour, ...] = ((235, 70, 70), (80, 200, 90), (80, 130, 255))  # x, y, z
 HEALTH: dict[str, Colour] = {
     "used": (60, 120, 75),
@@ -71,6 +74,27 @@ def shades(colour: Colour, count: int) -> list[Colour]:
     r, g, b = colour
     pale = (r // 2 + 125, g // 2 + 125, b // 2 + 125)
     return [((r, g, b), pale, (r // 2, g // 2, b // 2))[i % 3] for i in range(count)]
+
+
+def by_weight(share: np.ndarray) -> np.ndarray:
+    """Colours (*,) as 0xRRGGBBAA for weights (*,) between 0 and 1: dark blue for next to nothing, amber for all."""
+    return _RAMP[(255 * np.sqrt(np.clip(share, 0, 1))).astype(np.intp)]
+
+
+def by_distance(share: np.ndarray) -> np.ndarray:
+    """Colours (*,) as 0xRRGGBBAA for distances (*,) between 0 and 1: blue for near, red for far."""
+    return _DISTANCES[(255 * np.clip(share, 0, 1)).astype(np.intp)]
+
+
+def _ramp(low: Colour, high: Colour) -> np.ndarray:
+    share = np.linspace(0, 1, 256)[:, None]
+    rgb = ((1 - share) * np.array(low) + share * np.array(high)).astype(np.uint32)
+    packed: np.ndarray = (rgb[:, 0] << 24 | rgb[:, 1] << 16 | rgb[:, 2] << 8 | 255).astype(np.uint32)
+    return packed
+
+
+_RAMP = _ramp((40, 50, 110), ESTIMATE)
+_DISTANCES = _ramp((70, 140, 255), (255, 60, 60))
 
 
 def stage(name: str) -> str:

@@ -36,7 +36,9 @@ class Standing:
         self._paths: dict[str, _Drawn] = {}
         self._last: tuple[str, ...] = ()  # the stages whose geometry the last step drew
 
-    def draw(self, stage: str, field: str, path: str, at: Times, style: Any, count: int, **values: Array) -> None:
+    def draw(
+        self, stage: str, field: str, path: str, at: Times, style: Any, count: int | np.ndarray, **values: Array
+    ) -> None:
         """`count` points or arrows a row, in a style of their own."""
         kind = type(style)
         if path not in self._paths:

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 
 from viz_estim.core.descriptions import rebuild
+from viz_estim.core.modes import moments
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
 
@@ -52,7 +53,7 @@ class Gathered:
         self.times.append(times | {"time": nanoseconds / 1e9})
         for name in batch.schema.names:
             component = name.partition(":")[2]
-            if component and (self._points or not component.endswith(".points")):
+            if component and (self._points or not is_geometry(component)):
                 column = batch.column(name)
                 lengths = column.value_lengths().fill_null(0).to_numpy()
                 entry = (len(self.times) - 1, lengths, column.flatten().to_numpy())
@@ -60,6 +61,18 @@ class Gathered:
 
     def names(self) -> list[str]:
         return list(self.columns)
+
+    def ragged(self, name: str, width: int) -> np.ndarray:
+        """Values of another length in each row, as an array of arrays: (K, width), or (K,) for a width of 1."""
+        rows: list[Array] = [np.empty((0, width))] * sum(len(times["step"]) for times in self.times)
+        starts = np.concatenate([[0], np.cumsum([len(times["step"]) for times in self.times])])
+        for chunk, lengths, flat in self.columns.get(name, []):
+            for i, piece in enumerate(np.split(flat, np.cumsum(lengths)[:-1])):
+                rows[starts[chunk] + i] = piece.reshape(-1, width)
+        found = np.empty(len(rows), object)
+        for i, row in enumerate(rows):
+            found[i] = row[:, 0] if width == 1 else row
+        return found
 
     def index(self) -> dict[str, np.ndarray]:
         return {key: np.concatenate([times[key] for times in self.times]) for key in ("step", "stage", "time")}
@@ -87,9 +100,18 @@ class Gathered:
         return out.reshape(-1, *shape)
 
 
-def table_of(name: str, rows: Gathered, space: Space, fields: dict[str, Any]) -> StageTable:
+def is_geometry(name: str) -> bool:
+    """Whether it is one of the large quantities that `--every` thins: sigma points, clouds, matches."""
+    cloud = ("states", "log_weights", "log_likelihoods", "ancestors")
+    return name.endswith(".points") or name in cloud or name.startswith("matches.")
+
+
+def table_of(name: str, rows: Gathered, space: Space, fields: dict[str, Any], particles: int) -> StageTable:
+    """particles: how many of a cloud are kept, 0 where the belief is none."""
     n, d = len(space.names), len(space.axes)
-    shapes: dict[str, tuple[int, ...]] = {"mean": (n,), "cov": (d, d)}
+    shapes: dict[str, tuple[int, ...]] = {"mean": (n,), "cov": (d, d), "states": (particles, n)}
+    shapes["log_weights"] = (particles,)
+    ragged: dict[str, int] = {}
     spaces: dict[str, Space] = {}
     for field, what in fields.items():
         if "points" in what:
@@ -104,29 +126,55 @@ def table_of(name: str, rows: Gathered, space: Space, fields: dict[str, Any]) ->
             shapes |= {f"{field}.residual": (m,), f"{field}.cov": (m, m), f"{field}.noise": (m, m)}
             shapes |= {f"{field}.cross_cov": (d, m), f"{field}.blind": (d, s)}
             shapes |= {f"{field}.{part}": (s,) for part in ("used", "offered")}
+        elif "matches" in what:
+            d = what["matches"]
+            ragged |= {f"{field}.source": d, f"{field}.target": d, f"{field}.distance": 1}
+            ragged |= {f"{field}.source_index": 1, f"{field}.target_index": 1}
         elif "shape" in what:
             shapes[field] = tuple(what["shape"])
-    values = {
-        column: rows.column(column, shapes.get(column, (-1,)), fill=not column.endswith(".points"))
-        for column in rows.names()
-    }
+    values: dict[str, Any] = {}
+    for column in rows.names():
+        if column in ragged:
+            values[column] = rows.ragged(column, ragged[column])
+        else:
+            # The moments of a cloud are kept at the end of a step alone, and others must not be taken for them.
+            alone = is_geometry(column) or (particles and column in ("mean", "cov"))
+            values[column] = rows.column(column, shapes.get(column, (-1,)), fill=not alone)
+    if particles:
+        for column in ("mean", "cov"):
+            values.setdefault(column, np.full((len(rows.index()["step"]), *shapes[column]), np.nan))
     index = rows.index()
     return StageTable(name, index["step"], index["stage"], values, spaces)
 
 
 def fill_in(tables: dict[str, StageTable], fields: dict[str, Any]) -> None:
-    """Points that are those of the stage before were kept once: they are put where they belong."""
+    """Points and clouds that are those of the stage before were kept once: they are put where they belong."""
     for table in tables.values():
         for field, what in fields.get(table.name, {}).items():
             stage, earlier = what.get("same_as", (None, None))
-            if stage in tables and f"{earlier}.points" in tables[stage].values:
+            name, theirs_name = _column_of(field), _column_of(str(earlier))
+            if stage in tables and theirs_name in tables[stage].values:
                 source = tables[stage]
-                theirs = source.values[f"{earlier}.points"]
-                name = f"{field}.points"
+                theirs = source.values[theirs_name]
                 mine = table.values.setdefault(name, np.full((len(table.step), *theirs.shape[1:]), np.nan))
                 row = np.minimum(np.searchsorted(source.step, table.step), len(source.step) - 1)
                 lacking = np.isnan(mine).all((1, 2)) & (source.step[row] == table.step)
                 mine[lacking] = theirs[row[lacking]]
+
+
+def _column_of(field: str) -> str:
+    return "states" if field == "belief.states" else f"{field}.points"
+
+
+def work_out(tables: dict[str, StageTable], space: Space) -> None:
+    """The moments of the clouds that were recorded without them: all but those that end a step."""
+    for table in tables.values():
+        if "states" in table.values:
+            states, weights = table.values["states"], table.values["log_weights"]
+            lacking = np.flatnonzero(np.isnan(table.mean).all(1) & np.isfinite(weights).all(1))
+            for some in np.array_split(lacking, max(1, len(lacking) * weights.shape[1] // 50_000)):
+                if len(some):
+                    table.mean[some], table.cov[some] = moments(space, states[some], weights[some])
 
 
 def ends(steps: np.ndarray, tables: dict[str, StageTable], space: Space, labels: tuple[str, ...]) -> dict[str, Array]:

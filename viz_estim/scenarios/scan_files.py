@@ -59,24 +59,24 @@ def load(paths: list[Path]) -> ScanData:
 
 
 def save(folder: Path, data: ScanData) -> list[Path]:
-    """Writes both clouds and, where the truth is known, the list of their poses; Y's frame is the common one."""
-    d = data.X.shape[1]
-    paths = [folder / name for name in (_SAVED if data.truth is not None else _SAVED[:2])]
+    """Writes both clouds and the list of their poses, for simulated data; Y's frame is the common one."""
+    assert data.truth is not None
+    paths = [folder / name for name in _SAVED]
     for path in paths:
         if path.exists():
             raise BadInput(f"{path}: is there already, and may be real data; choose another folder or remove it")
         check_writable(path)
+    d = data.X.shape[1]
     for path, cloud in zip(paths, (data.X, data.Y), strict=False):
         with whole(path) as aside:
             np.savetxt(aside, cloud, "%.4f", ",", header=",".join(_AXES[:d]), comments="")
-    if data.truth is not None:
-        pose = np.eye(d + 1)
-        pose[:d, :d], pose[:d, d] = to_pose(data.truth)
-        lines = [",".join(["reading", *_matrix_names(d)])]
-        for path, matrix in zip(paths, (pose, np.eye(d + 1)), strict=False):
-            lines.append(",".join([path.name, *(f"{value:.17g}" for value in matrix.ravel())]))
-        with whole(paths[2]) as aside:
-            aside.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    pose = np.eye(d + 1)
+    pose[:d, :d], pose[:d, d] = to_pose(data.truth)
+    lines = [",".join(["reading", *_matrix_names(d)])]
+    for path, matrix in zip(paths, (pose, np.eye(d + 1)), strict=False):
+        lines.append(",".join([path.name, *(f"{value:.17g}" for value in matrix.ravel())]))
+    with whole(paths[2]) as aside:
+        aside.write_text("\n".join([*lines, ""]), encoding="utf-8")
     return paths
 
 

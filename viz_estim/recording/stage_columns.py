@@ -1,0 +1,74 @@
+"""The numbers of a stage as columns: the belief after it, and all that its record holds, bit for bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from viz_estim.core.stages import Innovation, Matches
+from viz_estim.recording.batch import Batch, StageRows, belief_fields
+from viz_estim.recording.columns import numbers, once
+from viz_estim.recording.layout import Layout
+
+_STAGE = "viz_estim.Stage"
+
+
+def stage_columns(layout: Layout, batch: Batch, rows: StageRows, every: int) -> list[rr.ComponentColumn]:
+    """All columns of one stage's rows; geometry (points, clouds, matches) at every N-th step alone."""
+    kept = rows.at.step % every == 0
+    fields = layout.stages[rows.name]
+    if layout.particles:
+        columns = _moments(rows, batch)
+        states = fields.get("belief.states")
+        columns += _thinned(rows, "belief.states", _own(rows, "belief.states", states, kept), "states")
+        columns += _thinned(rows, "belief.log_weights", kept, "log_weights")
+    else:
+        columns = [_column(rows, f"belief.{name}", name) for name in belief_fields(rows.stages[0].belief)]
+    for field, what in fields.items():
+        if "points" in what:
+            columns += _thinned(rows, f"{field}.points", _own(rows, field, what, kept))
+        elif "matches" in what:
+            for part in Matches.__slots__:
+                columns += _thinned(rows, f"{field}.{part}", kept)
+        elif "innovation" in what:
+            columns += [_column(rows, f"{field}.{part}") for part in Innovation.__slots__ if part != "space"]
+        elif "cloud" in what:
+            columns += _thinned(rows, field, kept)
+        elif "shape" in what:
+            columns.append(_column(rows, field))
+    return columns
+
+
+def _own(rows: StageRows, field: str, what: dict[str, list[str]] | None, kept: np.ndarray) -> np.ndarray:
+    """Which of the kept rows hold geometry that is not the stage before's own."""
+    return kept & ~rows.shared(field, what["same_as"][1]) if what and "same_as" in what else kept
+
+
+def _moments(rows: StageRows, batch: Batch) -> list[rr.ComponentColumn]:
+    """Mean and covariance of clouds, at the end of each step alone: of the others the reader works them out."""
+    if not rows.last.any():
+        return []
+    at = np.searchsorted(batch.end_rows, rows.rows)
+    values = zip(("mean", "cov"), batch.end_moments, strict=True)
+    if rows.last.all():
+        return [numbers(_STAGE, name, found[at]) for name, found in values]
+    return [
+        numbers(_STAGE, name, [found[i] if last else None for i, last in zip(at, rows.last, strict=True)])
+        for name, found in values
+    ]
+
+
+def _thinned(rows: StageRows, path: str, kept: np.ndarray, name: str | None = None) -> list[rr.ComponentColumn]:
+    """Geometry, in the rows where it is kept."""
+    if kept.all():
+        return [numbers(_STAGE, name or path, rows.values(path))]
+    values = zip(rows.objects(path), kept, strict=True)
+    return [numbers(_STAGE, name or path, [v if k else None for v, k in values])] if kept.any() else []
+
+
+def _column(rows: StageRows, path: str, name: str | None = None) -> rr.ComponentColumn:
+    """A quantity of the stage; once, where all rows hold the same object (a constant noise, say)."""
+    found = rows.objects(path)
+    if len(found) > 1 and found[0] is found[-1] and all(value is found[0] for value in found):
+        return once(_STAGE, name or path, found[0], len(found))
+    return numbers(_STAGE, name or path, rows.values(path))
