@@ -9,8 +9,23 @@ if TYPE_CHECKING:
     import numpy as np
 
     from viz_estim.recording.reader import Run
+    from viz_estim.recordings import record
+    from viz_estim.watching import watch
 
-__all__ = ["estimate_rot", "load"]
+__all__ = ["estimate_rot", "load", "record", "watch"]
+
+
+def __getattr__(name: str) -> Any:
+    """`record` and `watch`, which are read when they are asked for: they bring in the recording."""
+    if name == "record":
+        from viz_estim.recordings import record
+
+        return record
+    if name == "watch":
+        from viz_estim.watching import watch
+
+        return watch
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def load(path: str | Path) -> Run:

@@ -10,10 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from viz_estim import printing
+from viz_estim import diagnosing, printing
+from viz_estim.debugger import commands as debugging
 from viz_estim.errors import BadInput
-from viz_estim.files import check_writable, whole
-from viz_estim.parameters import nearest
+from viz_estim.files import check_writable
 
 _ENDINGS = {"tum": (".tum", ".txt"), "csv": (".csv",), "npz": (".npz",)}  # of what `export` writes
 
@@ -94,6 +94,14 @@ def _parser() -> argparse.ArgumentParser:
     _moment(p).add_argument("--stage", type=int, metavar="N", help="place on the stage timeline")
     p.add_argument("--size", type=_size, default=(1600, 1000), metavar="WxH")
     p.add_argument("-o", "--out", type=Path, required=True, metavar="PNG")
+    p = command("compare", _compare, "runs side by side in one recording, and their figures in one table")
+    p.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    p.add_argument("--out", type=Path, metavar="FILE", help="the recording (default: recordings/compare-….rrd)")
+    p.add_argument("--tol", type=float, default=1e-9, metavar="X", help="what differs by more is a difference")
+    p.add_argument("--open", action="store_true", help="open the recording when it is done")
+    _json(p)
+    diagnosing.add(command)
+    debugging.add(command, _inputs, _progress)
     p = command("calibrate", _calibrate, "fit sensor constants or noise covariances to ground truth")
     p.add_argument("system", choices=["imu", "diffdrive"], metavar="imu|diffdrive")
     p.add_argument("--data", type=Path, action="append", required=True, metavar="PATH")
@@ -224,24 +232,21 @@ def _asked(arguments: argparse.Namespace) -> tuple[str, float | None]:
     return "step", int(run.step[-1] if arguments.step is None else run.step[run.row(step=arguments.step)])
 
 
-def _calibrate(arguments: argparse.Namespace) -> None:
-    from viz_estim.recording import calibration_picture
-    from viz_estim.scenarios import SYSTEMS
+def _compare(arguments: argparse.Namespace) -> int:
+    from viz_estim.compare import compare
+    from viz_estim.recording.viewer import open_files
 
-    out: Path | None = arguments.out
-    if out:
-        check_writable(out, suffix=".json")
-        check_writable(out.with_suffix(".rrd"))
-    fitted = SYSTEMS[arguments.system].calibrate(arguments.data)
-    result = fitted.to_json()
-    if out:
-        made = {"calibration": str(out)}
-        if pictures := fitted.pictures():
-            made["recording"] = str(out.with_suffix(".rrd"))
-            calibration_picture.write(out.with_suffix(".rrd"), pictures, result)
-        with whole(out) as aside:
-            aside.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-        result |= made
+    result, text = compare(arguments.files, arguments.out, arguments.tol)
+    _print(result, lambda _: text, arguments.json)
+    if arguments.open:
+        open_files([Path(result["recording"])])
+    return 0 if result["same"] else 1
+
+
+def _calibrate(arguments: argparse.Namespace) -> None:
+    from viz_estim.calibrating import calibrate
+
+    result = calibrate(arguments.system, arguments.data, arguments.out)
     _print(result, printing.calibration_text, arguments.json)
 
 
@@ -258,26 +263,9 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> None:
-    import numpy as np
+    from viz_estim.simulating import simulate
 
-    from viz_estim.parameters import assign, parameters
-    from viz_estim.scenarios import SYSTEMS
-
-    if arguments.system not in SYSTEMS:
-        raise BadInput(f"no system {arguments.system}{nearest(arguments.system, SYSTEMS)}")
-    if arguments.seed < 0:
-        raise BadInput(f"--seed {arguments.seed}: expected a whole number from 0 on")
-    module = SYSTEMS[arguments.system]
-    make = getattr(module, arguments.system)
-    # Here every parameter is the data's: `freeze=0` and `data.freeze=0` mean the same.
-    settings = [text.removeprefix("data.") for text in arguments.settings]
-    params, _ = assign(settings, parameters(make), {}, f"simulate {arguments.system}")
-    data = make(None, np.random.default_rng(arguments.seed), **params)
-    folder: Path = arguments.out
-    if folder.exists() and not folder.is_dir():
-        raise BadInput(f"{folder}: is a file, expected a folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in module.save(data, folder):
+    for path in simulate(arguments.system, arguments.settings, arguments.seed, arguments.out):
         print(path)
 
 

@@ -58,14 +58,15 @@ def scenarios_text(value: dict[str, Any]) -> str:
 
 
 def result_text(result: dict[str, Any]) -> str:
-    """A run's result as a person reads it; the last line is the command that opens the recording."""
+    """A run's result as a person reads it; the last line opens the recording, or debugs it where the run failed."""
     wall = result["wall_s"]
     lines = [
         f"{result['scenario']}: {result['steps']} steps, {result['stages']} stages, {result['duration_s']:.2f} s of "
         f"data; {wall['estimate']:.2f} s to estimate, {wall['record']:.2f} s to record",
         *_figures(result),
     ]
-    return "\n".join([*lines, f"viz-estim open {result['recording']}"])
+    command = "debug" if result.get("error") else "open"
+    return "\n".join([*lines, f"viz-estim {command} {result['recording']}"])
 
 
 def _figures(result: dict[str, Any]) -> list[str]:

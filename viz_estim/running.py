@@ -135,6 +135,8 @@ def find(name: str) -> Source:
         module = inspect.getmodule(SCENARIOS[name])
         system = next(key for key, value in SYSTEMS.items() if value is module)
         return Source(name, SCENARIOS[name], _data_function(module, SCENARIOS[name], name), system)
+    if name.startswith("flawed:"):
+        return _flawed(name)
     file, colon, function = name.rpartition(":")
     if not colon or not file.endswith(".py"):
         hint = "" if not name.endswith(".py") else "; name the function too: FILE.py:function"
@@ -145,6 +147,16 @@ def find(name: str) -> Source:
         own = [k for k, v in vars(module).items() if inspect.isfunction(v) and v.__module__ == module.__name__]
         raise BadInput(f"{file}: no function {function}{nearest(function, own)}")
     return Source(name, found, _data_function(module, found, name))
+
+
+def _flawed(name: str) -> Source:
+    """A filter of the gallery of broken ones, over the healthy system's data."""
+    from viz_estim.scenarios.flawed import FLAWED
+
+    flaw = FLAWED.get(name.removeprefix("flawed:"))
+    if flaw is None:
+        raise BadInput(f"no scenario {name}{nearest(name, [f'flawed:{known}' for known in FLAWED])}")
+    return Source(name, flaw.scenario, flaw.data, next(key for key, value in SYSTEMS.items() if value is flaw.system))
 
 
 def _import(path: Path) -> Any:

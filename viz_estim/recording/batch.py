@@ -54,9 +54,9 @@ class StageRows:
         """Which rows had a stage before them."""
         return np.array([stage is not None for stage in self.before])
 
-    def shared(self, field: str, earlier: str) -> np.ndarray:
-        """Which rows hold in a field the very object that the stage before holds in its field `earlier`."""
-        theirs = [_read(before, earlier) for before in self.before]
+    def shared(self, field: str, stage: str, earlier: str) -> np.ndarray:
+        """Which rows hold in a field the very object that the stage before, if it is that one, holds in `earlier`."""
+        theirs = [_read(before, earlier) if before and before.name == stage else None for before in self.before]
         return np.array([mine is one for mine, one in zip(self.objects(field), theirs, strict=True)])
 
 
@@ -71,7 +71,7 @@ class Batch:
         self.steps = steps
         self.names = [tuple([stage.name for stage in step.stages]) for step in steps]
         # A step without any stage (it failed at once) still takes a place on the stage timeline.
-        counts = np.array([len(names) or 1 for names in self.names])
+        counts = np.maximum(list(map(len, self.names)), 1)
         places = first + np.concatenate([[0], np.cumsum(counts)])
         self.end = int(places[-1])
         self.times = Times(

@@ -79,7 +79,7 @@ class Clouds:
         colours = schema.by_weight(weights / weights.max(axis=1, keepdims=True))
         count, values = weights.shape[1], {"colors": colours}
         what = self._layout.stages[rows.name].get("belief.states", {})
-        shared = rows.shared("belief.states", "belief.states")[kept].all() if "same_as" in what else False
+        shared = rows.shared("belief.states", *what["same_as"])[kept].all() if "same_as" in what else False
         if not shared:
             states = rows.array("belief.states")[kept]
             places = self._places(states)

@@ -84,17 +84,19 @@ class Layout:
             if rows.name not in self.stages:
                 self._learn(rows)
                 new = True
+        for rows in batch.stages:  # all stages are known now: one may hold what another drew
             if self.particles and "belief.states" not in self.stages[rows.name] and len(rows.stages) > 1:
                 before = rows.before[-1]
                 if before is not None and before.belief.states is rows.stages[-1].belief.states:
                     self.stages[rows.name]["belief.states"] = {"same_as": [before.name, "belief.states"]}
                     new = True
             new |= self._learn_sources(rows)
-        seen: dict[str, None] = dict.fromkeys(self.inputs)
+        seen = dict.fromkeys(self.inputs)
         for step in batch.steps:
-            if step.tick.measurements.keys() - seen.keys() or step.tick.raw.keys() - seen.keys():
-                seen |= dict.fromkeys(step.tick.measurements) | dict.fromkeys(step.tick.raw)
-                new = True
+            for named in (step.tick.measurements, step.tick.raw):
+                if named and not named.keys() <= seen.keys():
+                    seen |= dict.fromkeys(named)
+                    new = True
         self.inputs = list(seen)
         return new
 

@@ -33,7 +33,7 @@ from viz_estim.recording.standing import Standing
 # A batch is cut by rows and bytes, which the same seed repeats; by time only where steps are so slow that a kill would
 # lose a second of them, or while a viewer watches.
 _ROWS = 1000
-_BYTES = 8 << 20
+_BYTES = 3 << 20
 _SECONDS = 0.6
 _SECONDS_WATCHED = 0.05
 
@@ -60,7 +60,8 @@ class Recorder:
         self._layout = Layout(scenario)
         self._last: Stage | None = None  # of the steps sent so far
         self._rows: list[Step] = []
-        self._limit = 1  # the first step goes out alone: it tells the size of the others, and the view
+        self._limit = _ROWS  # steps to a batch; the first few tell the size of the others
+        self._sized = 0
         self._viewed: list[str] | None = None
         self._places = 0  # taken on the stage timeline
         self._lock = threading.Lock()
@@ -104,6 +105,9 @@ class Recorder:
             if not self._rows:
                 self._oldest = time.monotonic()
             self._rows.append(step)
+            if self._sized < 3:
+                self._sized += 1
+                self._limit = max(1, min(self._limit, _BYTES // max(1, _size(step))))
             if len(self._rows) >= self._limit:
                 self._flush()
 
@@ -191,8 +195,6 @@ class Recorder:
             last = batch.times.pick(np.array([-1]))
             at = Times(last.step, last.time, np.array([batch.end - 1]))
             self._send(schema.EVENTS, at, rr.TextLog.columns(text=[text], level=["ERROR"]))
-        if self._limit == 1:
-            self._limit = max(1, min(_ROWS, _BYTES // max(1, _size(steps[0]))))
 
     def _send(self, path: str, at: Times, columns: Iterable[rr.ComponentColumn]) -> None:
         rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)

@@ -52,18 +52,18 @@ class Scenes:
     def _draw_points(self, rows: StageRows, field: str, at: Times, kept: np.ndarray, same_as: Any) -> None:
         """Sigma points: places in the world, an attitude's as tips of the body's axes on the sphere, a sensor's in its
         own space. Those that the stage before has drawn already stand on."""
+        shared = rows.shared(field, *same_as)[kept] if same_as else np.zeros(len(kept), bool)
+        if not shared.all():
+            own = np.flatnonzero(~shared)
+            self._draw_own_points(rows, field, at if not shared.any() else at.pick(own), kept[own])
         if same_as:
-            shared = rows.shared(field, same_as[1])[kept]
             self._standing.also(rows.name, same_as[0], same_as[1])
             ends = shared & np.concatenate([[self._drew.get((rows.name, field), False)], ~shared[:-1]])
-            self._drew[rows.name, field] = not shared[-1]
             if ends.any():
                 self._standing.take_away(rows.name, field, at.pick(np.flatnonzero(ends)))
-            if shared.all():
-                return
-            kept, at = kept[~shared], at.pick(np.flatnonzero(~shared))
-        else:
-            self._drew[rows.name, field] = True
+        self._drew[rows.name, field] = not shared[-1]
+
+    def _draw_own_points(self, rows: StageRows, field: str, at: Times, kept: np.ndarray) -> None:
         points = rows.array(f"{field}.points")[kept]
         space = as_product(getattr(rows.stages[0], field).space)
         count = points.shape[1]

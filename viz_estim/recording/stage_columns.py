@@ -41,7 +41,7 @@ def stage_columns(layout: Layout, batch: Batch, rows: StageRows, every: int) -> 
 
 def _own(rows: StageRows, field: str, what: dict[str, list[str]] | None, kept: np.ndarray) -> np.ndarray:
     """Which of the kept rows hold geometry that is not the stage before's own."""
-    return kept & ~rows.shared(field, what["same_as"][1]) if what and "same_as" in what else kept
+    return kept & ~rows.shared(field, *what["same_as"]) if what and "same_as" in what else kept
 
 
 def _moments(rows: StageRows, batch: Batch) -> list[rr.ComponentColumn]:
