@@ -34,6 +34,7 @@ class Standing:
     def __init__(self, stream: rr.RecordingStream, every: int) -> None:
         self._stream, self._every = stream, every
         self._paths: dict[str, _Drawn] = {}
+        self._more: dict[tuple[str, str], set[str]] = {}  # by stage and field: the other stages during which it stands
         self._last: tuple[str, ...] = ()  # the stages whose geometry the last step drew
 
     def draw(
@@ -48,10 +49,11 @@ class Standing:
 
     def add(self, stage: str, field: str, path: str, kind: Any, shape: str) -> None:
         """Takes in a path that another draws."""
-        self._paths.setdefault(path, _Drawn(stage, field, kind, shape, {stage}))
+        self._paths.setdefault(path, _Drawn(stage, field, kind, shape, {stage, *self._more.get((stage, field), ())}))
 
     def also(self, stage: str, of: str, field: str) -> None:
         """What a field of the stage `of` drew stands during `stage` too."""
+        self._more.setdefault((of, field), set()).add(stage)
         for one in self._paths.values():
             if (one.stage, one.field) == (of, field):
                 one.during.add(stage)
