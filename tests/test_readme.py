@@ -8,6 +8,7 @@ import pytest
 import viz_estim
 from viz_estim.cli import main
 from viz_estim.recording import schema
+from viz_estim.scenarios import SCENARIOS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -28,13 +29,25 @@ def test_its_filter_runs_and_is_recorded(tmp_path: Path, monkeypatch: pytest.Mon
     assert 0.8 < run.summary()["nees"]["inside"] <= 1.0
 
 
-def test_the_committed_sample_opens_as_arrays() -> None:
-    (path,) = (ROOT / "recordings").glob("*-sample.rrd")
+SAMPLES = sorted((ROOT / "recordings").glob("*-sample.rrd"))
+
+
+def test_every_scenario_has_a_small_sample() -> None:
+    assert {path.name.removesuffix("-sample.rrd") for path in SAMPLES} == set(SCENARIOS)
+    assert sum(path.stat().st_size for path in SAMPLES) <= 12_000_000
+
+
+@pytest.mark.parametrize("path", SAMPLES, ids=lambda path: path.stem)
+def test_a_committed_sample_opens_as_arrays(path: Path) -> None:
     run = viz_estim.load(path)
     assert path.stat().st_size <= 2_000_000
     assert run.complete
-    assert {"predict", "update"} <= set(run.stages)
-    assert run.summary() == {k: run.properties["result"][k] for k in ("metrics", "nis", "nees")}
+    assert run.error is None
+    assert run.properties["scenario"] == path.name.removesuffix("-sample.rrd")
+    told = run.properties["result"]
+    found = run.summary()
+    assert found["metrics"] == pytest.approx(told["metrics"])
+    assert (found["nis"], found["nees"]) == (told["nis"], pytest.approx(told["nees"]) if told["nees"] else None)
 
 
 def test_the_generated_set_is_what_simulate_writes(tmp_path: Path) -> None:

@@ -126,40 +126,70 @@ class Entry(NamedTuple):
     frame: str = ""
 
 
-_SENSOR_S, _PART_S, _TANGENT = "the sensor's", "the part's", "body (tangent at the estimate)"
+_SENSOR_S, _PART_S, _TANGENT = "the sensor's", "the part's", "tangent at the estimate"
 ENTITIES = (
-    Entry(
-        STEPS,
-        "`viz_estim.Step`: dt, control, `truth.<part>`, `z.<sensor>`, `raw.<sensor>`",
-        "SI, rad; counts",
-    ),
+    Entry(STEPS, "`viz_estim.Step`: dt, control, `truth.<part>`, `z.<sensor>`, `raw.<sensor>`", "SI, rad; counts"),
     Entry(
         "/stages/{stage}",
-        "`viz_estim.Stage`: mean, cov and the stage's own numbers (`gain`, `innovation.residual`, `sigma.points`, …), "
-        "float64, row-major",
+        "`viz_estim.Stage`: the belief (mean, cov; log_probabilities; states, log_weights) and the stage's own numbers "
+        "(`gain`, `innovation.residual`, `sigma.points`, `ancestors`, `matches.source`, …), float64, row-major; what "
+        "all rows share is in the first, points of the stage before are in that one",
         "SI, rad",
         "covariances: " + _TANGENT,
     ),
-    Entry("/world/estimate, /world/truth", "`Boxes3D`, `Arrows3D`: the body and its axes", "not to scale", "world"),
     Entry(
-        "/world/{stage}/{points}", "`Points3D`: an attitude's sigma points, as tips of the body's axes", "1", "world"
+        "/attitude/estimate, /attitude/truth", "`Boxes3D`, `Arrows3D`: the body and its axes", "not to scale", "world"
     ),
+    Entry("/attitude/{stage}/{points}", "`Points3D`: sigma points, as tips of the body's axes", "1", "world"),
+    Entry("/attitude/camera, …/picture", "`Pinhole`, `EncodedImage`: where the picture was taken, and it", "", "world"),
+    Entry(
+        "/canvas/mosaic, …/frame/…", "`EncodedImage`, `Points2D`: the mosaic so far, and where the picture lay", "½°"
+    ),
+    Entry("/canvas/degrees, /panorama/…", "the canvas's grid; the true panorama where it is known", "½°"),
+    Entry(
+        "/world/estimate, /world/truth",
+        "`Arrows3D`, `Boxes3D` or `Points3D`: the body; `…/trail`, `…/path` the way so far, `…/cov` the 3σ ellipsoid",
+        "m",
+        "world",
+    ),
+    Entry("/world/{stage}/{points}", "`Points3D`: the sigma points' places", "m", "world"),
+    Entry(
+        "/world/{stage}/{sensor}",
+        "`Points3D` or `Arrows3D`: a reading of a place; of ranges to landmarks",
+        "m",
+        "world",
+    ),
+    Entry(
+        "/world/{stage}/before, …/moved", "`Ellipsoids3D`, `Arrows3D`: 3σ before an update; K[:, j]·ν_j", "m", "world"
+    ),
+    Entry("/world/particles", "`Arrows3D` or `Points3D`: the cloud, coloured by weight", "m", "world"),
+    Entry("/world/modes", "`Ellipsoids3D`: 3σ of each mode, where there are several", "m", "world"),
+    Entry("/world/{stage}/ancestry", "`Arrows3D`: from parents, a step before, to the survivors", "m", "world"),
+    Entry("/world/{stage}/matches", "`Arrows3D`: pairs, coloured by distance", "m", "the fixed cloud's"),
+    Entry("/world/moved, /world/scenery", "clouds that the pose moves; what stands still", "m", "world"),
+    Entry("/bars/probability", "`Boxes3D`: the probability of each label", "1"),
     Entry("/sensors/{sensor}/{stage}/mapped", "`Points3D`: sigma points in the measurement", _SENSOR_S, "body"),
     Entry("/sensors/{sensor}/{stage}/measured", "`Arrows3D`: the reading", _SENSOR_S, "body"),
     Entry("/sensors/{sensor}/{stage}/predicted", "`Arrows3D`: the mean of what was expected", _SENSOR_S, "body"),
     Entry(
         "/plots/state/{part}.{component}",
-        "`Measurements`: the estimate with its ±1σ band, the truth, the sensor that reads it",
+        "`Measurements`: the estimate with its ±1σ band, the truth (`…/truth` where it has gaps), its sensor's reading",
         _PART_S,
         _PART_S,
     ),
     Entry(
-        "/plots/error/{part}.{axis}", "`Measurements`: the error, ±3σ of the covariance", "deg, " + _PART_S, _TANGENT
+        "/plots/error/{part}.{axis}",
+        "`Measurements`: the error (`…/value` where it has gaps), ±3σ of the covariance",
+        "deg, " + _PART_S,
+        _TANGENT,
     ),
     Entry("/plots/sigma/{part}", "`Measurements`: √ of the covariance's diagonal", "deg, " + _PART_S, _TANGENT),
     Entry("/plots/innovation/{sensor}.{axis}", "`Measurements`: the residual, ±3σ of S", _SENSOR_S, "body"),
     Entry("/plots/nis/{sensor}", "`Measurements`: normalised innovation squared, χ²'s 95 % interval", "1"),
-    Entry("/lanes/stage", "`StateChange`: the stage"),
+    Entry("/plots/moved/{part}.{axis}/{stage}", "`Measurements`: K[:, j]·ν_j by component of the reading", "σ before"),
+    Entry("/plots/figure/{stage}.{field}", "`Measurements`: a stage's single numbers (ESS, evidence, RMSE, …)"),
+    Entry("/plots/probability/labels", "`Measurements`: the probability of each label", "1"),
+    Entry("/lanes/stage, /lanes/truth", "`StateChange`: the stage; the true label"),
     Entry("/lanes/{sensor}", "`StateChange`: its reading was used, gated, frozen or absent"),
     Entry(EVENTS, "`TextLog`: what ended a run"),
     Entry(NOTES, "`TextDocument`: what to look at"),
