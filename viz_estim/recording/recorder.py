@@ -32,8 +32,8 @@ from viz_estim.recording.standing import Standing
 
 # A batch is cut by rows and bytes, which the same seed repeats; by time only where steps are so slow that a kill would
 # lose a second of them, or while a viewer watches.
-_ROWS = 1000
-_BYTES = 3 << 20
+_ROWS = (250, 1000)  # at least, for each batch has its cost; and at most
+_BYTES = (3 << 20, 64 << 20)  # about, above the least rows; and in no case more
 _SECONDS = 0.6
 _SECONDS_WATCHED = 0.05
 
@@ -60,7 +60,7 @@ class Recorder:
         self._layout = Layout(scenario)
         self._last: Stage | None = None  # of the steps sent so far
         self._rows: list[Step] = []
-        self._limit = _ROWS  # steps to a batch; the first few tell the size of the others
+        self._limit = _ROWS[1]  # steps to a batch; the first few tell the size of the others
         self._sized = 0
         self._viewed: list[str] | None = None
         self._places = 0  # taken on the stage timeline
@@ -107,7 +107,8 @@ class Recorder:
             self._rows.append(step)
             if self._sized < 3:
                 self._sized += 1
-                self._limit = max(1, min(self._limit, _BYTES // max(1, _size(step))))
+                few, most = (limit // max(1, _size(step)) for limit in _BYTES)
+                self._limit = max(1, min(self._limit, max(few, _ROWS[0]), most))
             if len(self._rows) >= self._limit:
                 self._flush()
 
