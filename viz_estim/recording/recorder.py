@@ -174,7 +174,8 @@ class Recorder:
             return
         batch = Batch(steps, self._places, self._last)
         self._places, self._last = batch.end, batch.last
-        new = self._layout.learn(batch)
+        if self._layout.learn(batch):  # before the columns that it describes: the file may be cut between them
+            self._send_properties()
         self._send_steps(batch)
         for rows in batch.stages:
             self._send(schema.stage(rows.name), rows.at, stage_columns(self._layout, batch, rows, self._every))
@@ -186,8 +187,6 @@ class Recorder:
         self._standing.clear(batch)
         self._plots.add(batch)
         self._pictures.add(batch)
-        if new:
-            self._send_properties()
         if self._viewed != (known := [*self._layout.sensors, *self._layout.stages]):  # the view is built from these
             self._viewed = known
             self._stream.send_blueprint(blueprints.build(self._layout))
