@@ -1,0 +1,96 @@
+"""The gallery of broken filters: each is found by its proper code. The table is printed (pytest -s)."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Cli, strict
+
+from viz_estim.core.run import run
+from viz_estim.diagnose import CODES, diagnose
+from viz_estim.recording.memory import collect
+from viz_estim.running import find
+from viz_estim.scenarios.flawed import FLAWED
+
+SEEDS = 10
+# Simulations as short as the flaws allow.
+SHORT: dict[str, dict[str, Any]] = {
+    "imu": {"duration": 3.4, "still": 0.6, "freeze": 0.0},
+    "landmarks": {"duration": 20.0},
+    "quadrotor": {"duration": 4.5},
+    "plaza": {"duration": 60.0},
+    "scan": {"points": 600},
+    "beacons": {},
+}
+OTHER: dict[str, dict[str, Any]] = {
+    "gyro-freeze": {"duration": 4.6, "freeze": 1.5},
+    "bias-by-median": {"duration": 5.0, "still": 3.0},
+    "delay-of-50-ms": {"duration": 4.2},
+}
+STEPS = {
+    "arithmetic-quaternion-mean": 60,
+    "heading-by-gravity": 150,
+    "bias-by-median": 300,
+    "unflipped-axes": 270,
+    "gyro-rows-as-xyz": 270,
+    "degrees-as-radians": 270,
+    "g-as-mps2": 150,
+    "gyro-freeze": 430,
+}
+
+
+def found(name: str, seed: int) -> set[str]:
+    """The codes that a flaw is found by, notes left out."""
+    flaw = FLAWED[name]
+    system = flaw.system.__name__.rpartition(".")[2]
+    data = flaw.data(None, np.random.default_rng(seed), **SHORT[system] | OTHER.get(name, {}))
+    scenario = flaw.scenario(data)
+    scenario = replace(scenario, ticks=scenario.ticks[: STEPS.get(name)])
+    findings = diagnose(collect(scenario, run(scenario, seed)))
+    assert {finding.code for finding in findings} <= CODES.keys()
+    return {finding.code for finding in findings if finding.severity != "note"}
+
+
+def test_each_flaw_is_found_by_its_code() -> None:
+    assert len(FLAWED) >= 20
+    hits, lines = {}, [f"{'flaw':32}{'code':22}found  beside it"]
+    for name, flaw in FLAWED.items():
+        codes = Counter(code for seed in range(SEEDS) for code in found(name, seed))
+        hits[name] = codes.pop(flaw.code, 0)
+        others = ", ".join(f"{code} {count}" for code, count in codes.most_common())
+        lines.append(f"{name:32}{flaw.code:22}{hits[name]:2}/{SEEDS}  {others}")
+    table = "\n".join(lines)
+    print(f"\n{table}")
+    assert min(hits.values()) >= 9, table
+    assert sum(hits.values()) >= 0.95 * SEEDS * len(hits), table
+
+
+def test_every_flaw_is_a_scenario_with_a_description_over_its_system_s_data() -> None:
+    for name, flaw in FLAWED.items():
+        source = find(f"flawed:{name}")
+        assert source.system
+        assert source.data is flaw.data
+        assert (flaw.scenario.__doc__ or "").endswith(".")
+        assert flaw.code in CODES
+
+
+def test_a_flaw_runs_and_is_diagnosed_from_its_file(cli: Cli, tmp_path: Path) -> None:
+    path = tmp_path / "flawed.rrd"
+    made = strict(
+        cli("run", "flawed:noise-too-small", "--seed", "3", "--set", "data.duration=20", "--out", path, "--json")
+    )
+    assert made["scenario"] == "flawed:noise-too-small"
+    done = cli("diagnose", path)
+    assert done.code == 1
+    assert "overconfident range" in done.out
+
+
+@pytest.mark.parametrize("name", ["flawed:", "flawed:nothing-like-it", "flawed:gyro-freze"])
+def test_an_unknown_flaw_is_bad_input(cli: Cli, name: str) -> None:
+    done = cli("run", name)
+    assert done.code == 2
+    assert done.err.count("\n") == 1
+    assert name in done.err

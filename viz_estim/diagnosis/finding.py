@@ -1,0 +1,80 @@
+"""A finding, the codes there are, and how the rate of false alarms is shared among all that a run is tested for.
+
+A run has so many sensors, components and checks that one of them would always look odd. Each statistical check
+therefore states the probability p that data of the filter's own model look as odd as this, and p is held to an equal
+share of the run's budget (Bonferroni): of 10⁻⁴ for an error, of 0.05 for a warning. An error must be large besides:
+with enough data every filter is wrong by a little. A check of what cannot be (an asymmetric covariance) costs nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+Severity = Literal["error", "warning", "note"]
+
+CODES = {
+    "failed": "the run ended by an exception of the filter",
+    "sensor_frozen": "a sensor's readings stick at one value while another sensor shows motion",
+    "sensor_silent": "a sensor stops giving readings, or pauses for far longer than its interval",
+    "sensor_saturated": "readings pile up at the end of the sensor's range",
+    "used_twice": "one reading is taken in as two",
+    "overconfident": "innovations (NIS) or errors (NEES) are larger than the covariance says",
+    "underconfident": "innovations (NIS) or errors (NEES) are smaller than the covariance says",
+    "biased_innovation": "innovations lie off zero on one side",
+    "coloured_innovation": "an innovation tells of the next one: something systematic is left in them",
+    "outliers": "more readings lie far off than the noise allows",
+    "gate": "a gate refuses too many readings, or is locked out",
+    "diverged": "error or NIS leaves its bounds and does not come back",
+    "stamps": "gaps, duplicates or steps back in time; a dt that is not the stamps' difference",
+    "lag": "a sensor's readings are constantly late or early against the state",
+    "covariance": "a covariance that is not symmetric, not positive definite, ill-conditioned, collapsed or boundless",
+    "unobservable_update": "an update gains information on a direction that its sensor cannot see",
+    "angle_wrap": "innovations near a full turn, quaternions off the sphere, or sign flips",
+    "units_or_axes": "swapped axes, a sign or another unit would explain the readings",
+    "jacobian": "a Jacobian is not the derivative of the model that it stands for",
+    "noisy_prediction": "the prediction moves the mean at random: a sample of the noise was added to it",
+    "particles_collapsed": "hardly any distinct particles or weights are left",
+    "particles_clamped": "particles are held at a bound",
+    "several_modes": "the particles form several clouds, between which the mean lies",
+    "icp_not_converged": "the iterations ended before the matches repeated",
+    "icp_few_matches": "hardly any points have a match",
+    "icp_rmse_rises": "the matches' RMSE rises while their number does not",
+}
+_ORDER: tuple[Severity, ...] = ("error", "warning", "note")
+
+_BUDGET: dict[Severity, float] = {"error": 1e-4, "warning": 0.05}  # false alarms a run
+_FAMILIES = 20  # statistical checks: each has an equal share, and shares it out among what it tests
+
+
+@dataclass(frozen=True)
+class Finding:
+    """steps: first and last, inclusive. evidence: numbers by name. cause and remedy speak to a student."""
+
+    code: str
+    severity: Severity
+    sensor: str | None
+    steps: tuple[int, int]
+    evidence: dict[str, Any]
+    cause: str
+    remedy: str
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self) | {"steps": list(self.steps)}
+
+    @property
+    def order(self) -> tuple[int, int]:
+        """Errors first, then by when it began."""
+        return _ORDER.index(self.severity), self.steps[0]
+
+
+def level(severity: Severity, tests: int) -> float:
+    """The p below which one of a check's `tests` in this run is a finding of the severity."""
+    return _BUDGET[severity] / _FAMILIES / max(1, tests)
+
+
+def judge(p: float, tests: int, *, large: bool) -> Severity | None:
+    """What a test's p makes it, of `tests` in this run: an error only where the effect is large too."""
+    if not p < level("warning", tests):  # also NaN
+        return None
+    return "error" if large and p < level("error", tests) else "warning"

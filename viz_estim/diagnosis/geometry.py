@@ -1,0 +1,102 @@
+"""Angles, quaternions, units and axes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from viz_estim.core.consistency import squared_distance
+from viz_estim.core.spaces import SO3, Euclidean
+from viz_estim.diagnosis.axes import EXPLAINED, finding_of, maps
+from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.finding import Finding, level
+from viz_estim.diagnosis.kinematics import imu_axes
+from viz_estim.recording.layout import leaves
+
+_BURST, _BESIDE = 100.0, 0.3  # of the usual S; rad from ±π
+
+
+def wraps(case: Case) -> Iterator[Finding]:
+    """Innovations beyond a half turn, which no wrapped difference is; or an S that bursts beside ±π.
+
+    The second is what sigma points do that lie on both sides of the seam, where their plain mean is a quarter turn off.
+    """
+    for name, readings in case.sensors.items():
+        for i, unit in enumerate(readings.space.axis_units):
+            if unit != "rad" or isinstance(readings.space, SO3):
+                continue
+            variance, wide = readings.cov[:, i, i], np.zeros(len(readings), bool)
+            if readings.z.shape == readings.residual.shape:
+                wide = (variance > _BURST * np.median(variance)) & (np.abs(readings.z[:, i]) > np.pi - _BESIDE)
+            rows = np.flatnonzero((np.abs(readings.residual[:, i]) > np.pi) | wide)
+            if len(rows):
+                axis = readings.space.axes[i]
+                steps = int(readings.step[rows[0]]), int(readings.step[rows[-1]])
+                yield Finding(
+                    "angle_wrap", "error", name, steps, {"component": axis, "count": len(rows)},
+                    f"innovations of {name} ({axis}) jump by a turn, first at step {steps[0]}: the difference of two "
+                    "angles is not wrapped",
+                    "wrap the residual to [−π, π), by SO2().minus, not z − h(x)",
+                )  # fmt: skip
+                break
+
+
+def quaternion_norms(case: Case) -> Iterator[Finding]:
+    """Quaternions off the unit sphere by more than rounding, and estimates that change their sign from step to step."""
+    run = case.run
+    parts = [(name, at) for name, part, at in leaves(case.space) if isinstance(part, SO3)]
+    for name, at in parts:
+        off: list[tuple[int, float, str]] = []
+        for stage, table in run.stages.items():
+            q = table.values["mean"][:, at] if "mean" in table.values else np.empty((0, 4))
+            error = np.abs(np.linalg.norm(q, axis=1) - 1)
+            rows = np.flatnonzero(error > 1e-7)
+            off += [(int(table.step[row]), float(error[row]), stage) for row in rows]
+        if off:
+            steps = min(off)[0], max(off)[0]
+            evidence = {"kind": "norm", "part": name, "stage": max(off, key=lambda o: o[1])[2], "count": len(off)}
+            yield Finding(
+                "angle_wrap", "error", None, steps, evidence | {"worst": max(o[1] for o in off)},
+                f"the quaternion of {name} is off the unit sphere by up to {max(o[1] for o in off):.2g}: it is "
+                "averaged or moved as four plain numbers",
+                "average attitudes on the manifold (SO3().mean), and move them by SO3().plus",
+            )  # fmt: skip
+        q = run.mean[:, at]
+        flips = np.flatnonzero(((q[1:] * q[:-1]).sum(1) < -0.5) & (run.step[1:] > case.first)) + 1
+        turned = np.linalg.norm(SO3().minus(q[1:], q[:-1]), axis=1)
+        flips = flips[turned[flips - 1] < 1.0]
+        if len(flips) > 1 and len(flips) > len(q) / 200:
+            yield Finding(
+                "angle_wrap", "warning", None, (int(run.step[flips[0]]), int(run.step[flips[-1]])),
+                {"kind": "sign", "part": name, "count": len(flips)},
+                f"the quaternion of {name} changes its sign {len(flips)} times: q and −q are one attitude, but four "
+                "plain numbers jump",
+                "keep it in one hemisphere (quaternions.continuous) before numbers are averaged or plotted",
+            )  # fmt: skip
+
+
+def units_or_axes(case: Case) -> Iterator[Finding]:
+    """Readings that a map M would bring to what was expected: the gain in log-likelihood, ½Σ(|ν|² − |M·z − ẑ|²) in S.
+
+    If the innovations are N(0, S), a gain above log(1/α) has at most the probability α, for any one map (Markov's
+    inequality on a likelihood ratio; Ville 1939).
+    """
+    told = set()
+    for finding in imu_axes(case):
+        told.add(finding.sensor)
+        yield finding
+    for name, readings in case.sensors.items():
+        space = readings.space
+        if told or not isinstance(space, Euclidean) or not 1 <= len(space.axes) <= 3 or len(readings) < 10:
+            continue
+        own = float(np.nansum(readings.nis))
+        candidates = list(maps(len(space.axes)))
+        best, what = np.inf, ""
+        for title, M in candidates:
+            value = float(np.nansum(squared_distance(readings.z @ M.T - readings.predicted, readings.cov)))
+            if value < best:
+                best, what = value, title
+        gain, explained = 0.5 * (own - best), 1 - best / max(own, 1e-300)
+        if gain > -np.log(level("error", 60 * len(case.sensors))) and explained > EXPLAINED:
+            yield finding_of(name, readings.steps, what, explained, gain)

@@ -1,0 +1,244 @@
+"""Are innovations what they should be: zero in the mean, each its own draw, normal in the tails?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from scipy.stats import binom, chi2, t
+
+from viz_estim.core.consistency import nees
+from viz_estim.core.quaternions import Array
+from viz_estim.diagnosis.evidence import Case, Readings, parameter
+from viz_estim.diagnosis.finding import Finding, judge, level
+
+_FEWEST = 20
+_LAGS = 10
+_STRETCHES = 20
+_LARGE_BIAS, _LARGE_CORRELATION = 0.5, 0.5  # of a standard deviation; of a correlation
+_TAIL = 1e-3  # the share of readings beyond the χ² quantile by which outliers are counted
+_LARGE_SHARE = 0.02
+_REFUSED = 0.05  # the share of readings that a gate may refuse
+
+
+def biased(case: Case) -> Iterator[Finding]:
+    """The mean of each component of the innovation against its standard error: a t-test.
+
+    The standard error takes autocorrelation in: s·√(τ/N), τ = 1 + 2·Σρₖ over the first lags, at least 1; and the means
+    of 20 stretches of the run must say the same (batch means; Schmeiser 1982): the larger p counts.
+    """
+    tests = sum(readings.dof for readings in case.sensors.values())
+    for name, readings in case.sensors.items():
+        N = len(readings)
+        if N < _FEWEST:
+            continue
+        for i, axis in enumerate(readings.space.axes):
+            values = readings.scaled[:, i]
+            tau = max(1.0, 1 + 2 * float(_autocorrelations(values[:, None] - values.mean())[0].sum()))
+            mean, error = float(values.mean()), float(values.std(ddof=1) * np.sqrt(tau / N))
+            if error <= 0:
+                continue
+            score = mean / error
+            stretches = np.array([piece.mean() for piece in np.array_split(values, min(_STRETCHES, N // 5))])
+            apart = mean / max(float(stretches.std(ddof=1)) / np.sqrt(len(stretches)), 1e-300)
+            p = float(max(2 * t.sf(abs(score), max(1, N / tau - 1)), 2 * t.sf(abs(apart), len(stretches) - 1)))
+            severity = judge(p, tests, large=abs(mean) > _LARGE_BIAS)
+            if severity:
+                value, unit = float(readings.residual[:, i].mean()), readings.space.axis_units[i]
+                evidence = {"component": axis, "mean": value, "mean_sigma": mean, "z": score, "p": p}
+                label = name if axis in ("", name) else f"{name} {axis}"
+                yield Finding(
+                    "biased_innovation", severity, name, readings.steps, evidence,
+                    f"readings of {label} lie {value:+.3g} {unit} off what is expected, on the average over the run "
+                    f"({score:+.1f} standard errors): the sensor has a bias that the state lacks, or the model has one",
+                    f"subtract the bias by a calibration, or add it to the state and let the filter estimate it; check "
+                    f"the sign and the mounting of {name}",
+                )  # fmt: skip
+                break  # one finding a sensor: its worst-known component leads on
+
+
+def coloured(case: Case) -> Iterator[Finding]:
+    """Ljung and Box (1978): Q = N(N+2)·Σₖ ρₖ²/(N−k) over the lags and the whitened components is χ²(lags·m)."""
+    for name, readings in case.sensors.items():
+        N = len(readings)
+        lags = min(_LAGS, N // 5)
+        if N < _FEWEST:
+            continue
+        white = readings.white - readings.white.mean(0)
+        rho = _autocorrelations(white, lags)
+        Q = N * (N + 2) * float((rho**2 / (N - np.arange(1, lags + 1))).sum())
+        p = float(chi2.sf(Q, rho.size))
+        component, lag = np.unravel_index(np.argmax(np.abs(rho)), rho.shape)
+        strongest = float(rho[component, lag])
+        severity = judge(p, len(case.sensors), large=abs(strongest) > _LARGE_CORRELATION)
+        if severity:
+            seconds = float(np.median(readings.time[lag + 1 :] - readings.time[: -(lag + 1)]))
+            evidence = {"ljung_box": Q, "p": p, "lag": int(lag) + 1, "lag_s": seconds, "autocorrelation": strongest}
+            yield Finding(
+                "coloured_innovation", severity, name, readings.steps, evidence, *_colour(name, strongest, seconds)
+            )
+
+
+def _colour(name: str, strongest: float, seconds: float) -> tuple[str, str]:
+    if strongest > 0:
+        return (
+            f"an innovation of {name} is like the one {seconds:.3g} s before it (correlation {strongest:.2f}): what is "
+            "wrong stays wrong, as with a Q that is too small, a motion the model lacks, or noise that is coloured",
+            "raise the process noise and see whether the correlation falls; else add what is missing to the state, "
+            f"and check the stamps of {name} for a delay",
+        )
+    return (
+        f"an innovation of {name} is undone by the one {seconds:.3g} s after it (correlation {strongest:.2f}): the "
+        "filter over-corrects, as with a Q that is too large, an R too small, or a reading that is taken in twice",
+        f"lower the process noise or raise the noise of {name}; check that each reading enters once",
+    )
+
+
+def _autocorrelations(values: Array, lags: int = _LAGS) -> Array:
+    """(m, lags) of N centred values (N, m)."""
+    total = np.maximum((values**2).sum(0), 1e-300)
+    return np.stack([(values[k:] * values[:-k]).sum(0) / total for k in range(1, lags + 1)], axis=-1)
+
+
+def outliers(case: Case) -> Iterator[Finding]:
+    """How many NIS lie beyond the χ² quantile of 1 − 10⁻³: binomial, if the tails are normal.
+
+    NIS are first brought to their median, where that is above χ²'s: a noise that is too small is no outlier.
+    """
+    for name, readings in case.sensors.items():
+        N, dof = len(readings), readings.dof
+        if N < _FEWEST:
+            continue
+        scale = max(1.0, float(np.median(readings.nis)) / chi2.median(dof))
+        far = readings.nis / scale > chi2.isf(_TAIL, dof)
+        count = int(far.sum())
+        p = float(binom.sf(count - 1, N, _TAIL))
+        severity = judge(p, len(case.sensors), large=count > _LARGE_SHARE * N)
+        if severity:
+            rows = np.flatnonzero(far)
+            gated = int((~readings.used[far]).sum())
+            evidence: dict[str, Any] = {"outliers": count, "readings": N, "expected": N * _TAIL, "p": p}
+            evidence |= {"refused_by_gate": gated, "largest_nis": float(readings.nis.max())}
+            remedy = (
+                f"the gate refuses {gated} of them; look at the others by hand"
+                if gated
+                else f"set a gate ({_gate_name(case, name)}=0.999) so that they move nothing; see where they come from"
+            )
+            yield Finding(
+                "outliers", severity if gated < count else "note", name,
+                (int(readings.step[rows[0]]), int(readings.step[rows[-1]])), evidence,
+                f"{count} of {N} readings of {name} lie further off than one in a thousand should ({N * _TAIL:.2g} "
+                "expected): detours, glitches or wrong associations, which a normal noise does not have",
+                remedy,
+            )  # fmt: skip
+
+
+def _gate_name(case: Case, name: str) -> str:
+    known = parameter(case.run, f"{name}_gate", "gate")
+    return known[0] if known else "gate"
+
+
+def gates(case: Case) -> Iterator[Finding]:
+    """A gate that refuses more than 5 % of the readings (binomial), or that has locked itself out.
+
+    Locked out: so long a row of refusals as would come by chance with 5 % refused, p = N·0.05ⁿ.
+    """
+    for name, readings in case.sensors.items():
+        refused = ~readings.used
+        N, count = len(readings), int(refused.sum())
+        if not count:
+            continue
+        first, length = _longest(refused)
+        p_row, p = min(1.0, N * _REFUSED**length), float(binom.sf(count - 1, N, _REFUSED))
+        locked = p_row < level("error", 2 * len(case.sensors)) and first + length == N
+        severity = judge(min(p, p_row), 2 * len(case.sensors), large=locked or count > 0.25 * N)
+        if severity:
+            start = first if locked else int(np.argmax(refused))
+            steps = int(readings.step[start]), int(readings.step[np.flatnonzero(refused)[-1]])
+            evidence = {"refused": count, "readings": N, "longest_row": length, "p": min(p, p_row)}
+            gate = _gate_name(case, name)
+            how = f"the gate of {name} refuses {count} of {N} readings"
+            if locked:
+                cause = f"{how}, and from step {steps[0]} on all of them: the estimate has left, and can't come back"
+                remedy = f"set {gate}=none to see what is refused; raise the noises that are too small, then gate again"
+            else:
+                cause = f"{how}, where 5 % would be many: it is too narrow, or S is too small"
+                remedy = f"set {gate}=0.999, or none; if readings are then far off, mend the noise of {name} first"
+            yield Finding("gate", severity, name, steps, evidence, cause, remedy)
+
+
+def _longest(flags: np.ndarray) -> tuple[int, int]:
+    """Start and length of the longest row of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
+    lengths = edges[:, 1] - edges[:, 0]
+    best = int(np.argmax(lengths))
+    return int(edges[best, 0]), int(lengths[best])
+
+
+def diverged(case: Case) -> Iterator[Finding]:
+    """NIS leaves for good: from some step on every block of readings lies above its χ² band, after some that did not.
+
+    A block's sum is χ²(B·dof); a row of n such blocks at the level α each has the probability αⁿ.
+    """
+    for name, readings in case.sensors.items():
+        block, blocks = _blocks(readings)
+        if blocks < 6:
+            continue
+        alpha = 1e-3
+        sums = readings.nis[-block * blocks :].reshape(blocks, block).sum(1)
+        high = sums > chi2.isf(alpha, block * readings.dof)
+        low = np.flatnonzero(~high)
+        start = int(low[-1]) + 1 if len(low) else 0
+        row = blocks - start
+        growth = float(sums[start:].mean() / max(sums[:start].mean(), 1e-300)) if 0 < start < blocks else 0.0
+        if row < 3 or growth < 4:
+            continue
+        at = len(readings) - block * (blocks - start)
+        severity = judge(blocks * alpha**row, len(case.sensors), large=growth > 4)
+        if severity:
+            steps = int(readings.step[at]), int(readings.step[-1])
+            evidence = {"onset_step": steps[0], "onset_s": float(readings.time[at]), "growth": growth}
+            yield Finding(
+                "diverged", severity, name, steps, evidence,
+                f"from step {steps[0]} on innovations of {name} stay {growth**0.5:.2g}× as large as before: the "
+                "estimate has left the readings and does not come back",
+                f"go to step {steps[0]} and step through its stages: what moved the estimate, or why does the gain not "
+                "pull it back (a covariance that is too small, a wrong linearisation, a gate that is locked out)?",
+            )  # fmt: skip
+
+
+def _blocks(readings: Readings) -> tuple[int, int]:
+    """Length and number of blocks: 24 of them, of at least five readings."""
+    block = max(5, len(readings) // 24)
+    return block, len(readings) // block
+
+
+def lost(case: Case) -> Iterator[Finding]:
+    """The error leaves for good: from some step to the end every NEES is beyond χ²'s quantile of 10⁻⁶.
+
+    One step alone would make that a false alarm once in a million; at most a warning where it lasts less than a tenth
+    of the run.
+    """
+    run = case.run
+    if run.labels or "mean" not in run.ends or run.properties.get("belief") == "Particles":
+        return
+    values, dof = nees(run.space, run.mean, run.cov, run.truth)
+    rows = np.flatnonzero(np.isfinite(values) & (run.step >= case.first))
+    if len(rows) < _FEWEST:
+        return
+    inside = np.flatnonzero(values[rows] <= chi2.isf(1e-6, dof))
+    start = int(inside[-1]) + 1 if len(inside) else 0
+    lasting = len(rows) - start
+    if lasting < max(3, len(rows) // 20):
+        return
+    steps = int(run.step[rows[start]]), int(run.step[rows[-1]])
+    evidence = {"onset_step": steps[0], "mean_nees": float(values[rows[start:]].mean()), "dof": dof}
+    since = "from the start" if start == 0 else f"from step {steps[0]} on"
+    yield Finding(
+        "diverged", "error" if lasting > len(rows) / 10 else "warning", None, steps, evidence,
+        f"{since} the estimate is further from the truth than its covariance allows, to the end: it is sure of a wrong "
+        "state" + (", such as a mirror image that explains the readings as well" if start == 0 else ""),
+        f"go to step {steps[0]} and see which stage moves it away; a start elsewhere, or a larger initial covariance, "
+        "tells whether it can find back",
+    )  # fmt: skip

@@ -1,0 +1,102 @@
+"""A gyro and an accelerometer against each other: gravity must turn as the gyro says, whatever the filter does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from viz_estim.core import quaternions
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import SO3
+from viz_estim.diagnosis.axes import EXPLAINED, finding_of, maps
+from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.finding import Finding, level
+from viz_estim.diagnosis.sensors import Imu, imu
+from viz_estim.scenarios.imu_health import GRAVITY
+
+_WINDOW = 0.1  # s over which gravity's turn is compared with the gyro's
+_DEPENDENT = 4  # windows that share one push of the hand
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def imu_axes(case: Case) -> Iterator[Finding]:
+    """ġ = −ω × g in the body's frame, over windows of 0.1 s, for each map of the one or the other sensor.
+
+    The gain in log-likelihood is ½·(E(1) − E(M))/σ², where E is the sum of squares left and σ² that of the best map; if
+    the readings are as they should be it exceeds log(1/α) with the probability α at most (Ville 1939). A map of gravity
+    and its inverse of the rate say the same of the pair: motion capture tells them apart where there is any, else
+    gravity's length and its direction at rest in the truth's stead: `sensor` is then `gyro` for a map of proper turns
+    that keep up upright, else `accel`.
+    """
+    both = imu(case.run)
+    if both is None:
+        return
+    pieces = _windows(case, both)
+    if pieces is None:
+        return
+    turn, middle, change, steps = pieces
+    own = _left(turn, middle, change)
+    candidates = list(maps(3))
+    of_rate = [_left(turn @ M.T, middle, change) for _, M in candidates]
+    of_force = [
+        _left(turn, middle @ M.T, change @ M.T) if abs(np.linalg.det(M)) == 1 else np.inf for _, M in candidates
+    ]
+    length = float(np.median(np.linalg.norm(both.force, axis=1)))
+    least = min(*of_rate, *of_force)
+    variance = max(least, 1e-12) / change.size
+    gain, explained = 0.5 * (own - least) / variance / _DEPENDENT, 1 - least / max(own, 1e-300)
+    if gain > -np.log(level("error", 2 * len(candidates))) and explained > EXPLAINED:
+        blamed = _blamed(case, both)
+        if blamed == "accel" and min(of_force) < 1.5 * least:
+            name, what = "accel", candidates[int(np.argmin(of_force))][0]
+        else:
+            name, what = "gyro", candidates[int(np.argmin(of_rate))][0]
+        yield finding_of(name, steps, what, explained, gain)
+    if not 0.5 < length / GRAVITY < 2:
+        factor = min((abs(np.log(length * M[0, 0] / GRAVITY)), t) for t, M in candidates if t[:4] != "axes")
+        if factor[0] < 0.2:
+            yield finding_of("accel", steps, factor[1], 1 - abs(1 - np.exp(factor[0])), float(len(both.rows)))
+
+
+def _windows(case: Case, both: Imu) -> tuple[Array, Array, Array, tuple[int, int]] | None:
+    """By window: the gyro's turn (W, 3) rad, gravity's unit direction (W, 3) and its change (W, 3); frozen times are
+    left out, as the readings of the filter's sensors are."""
+    time = case.run.time[both.rows]
+    n = max(2, round(_WINDOW / max(float(np.median(np.diff(time))), 1e-6)))
+    W = len(time) // n
+    if W < 12:
+        return None
+    force = both.force[: W * n].reshape(W, n, 3).mean(1)
+    force = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-9)
+    middle_time = time[: W * n].reshape(W, n).mean(1)
+    rate = both.rate[: W * n].reshape(W, n, 3).mean(1)
+    turn = 0.5 * (rate[1:] + rate[:-1]) * np.diff(middle_time)[:, None]
+    read = {int(step) for readings in case.sensors.values() for step in readings.step}
+    at = case.run.step[both.rows]
+    fine = np.asarray(np.array([int(step) in read for step in at[: W * n]]).reshape(W, n).all(axis=1))
+    fine = fine[1:] & fine[:-1]
+    if fine.sum() < 12:
+        return None
+    middle, change = 0.5 * (force[1:] + force[:-1]), force[1:] - force[:-1]
+    return turn[fine], middle[fine], change[fine], (int(at[0]), int(at[-1]))
+
+
+def _left(turn: Array, middle: Array, change: Array) -> float:
+    """Σ|Δg + θ × g|²."""
+    return float(np.square(change + np.cross(turn, middle)).sum())
+
+
+def _blamed(case: Case, both: Imu) -> str:
+    """Which of the two disagrees with the truth's attitude, if there is any; else the gyro."""
+    run = case.run
+    for name, part in case.space.parts.items():
+        if isinstance(part, SO3):
+            truth = run.truth[both.rows][:, case.space.at[name]]
+            known = np.isfinite(truth).all(1)
+            if known.any():
+                up = quaternions.rotate(quaternions.conjugate(truth[known]), _UP)
+                seen = both.force[known] / np.linalg.norm(both.force[known], axis=1, keepdims=True)
+                return "accel" if float((up * seen).sum(1).mean()) < 0.7 else "gyro"
+    level_at_rest = both.force[: max(1, len(both.force) // 20)].mean(0)
+    return "accel" if level_at_rest[2] < 0.5 * np.linalg.norm(level_at_rest) else "gyro"

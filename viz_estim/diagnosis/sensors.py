@@ -1,0 +1,294 @@
+"""Do the sensors themselves work? Read from what they gave, before any filter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import binom, t
+
+from viz_estim.core.quaternions import Array
+from viz_estim.diagnosis.finding import Finding, judge, level
+from viz_estim.recording.layout import as_product
+from viz_estim.recording.reader import Run
+from viz_estim.scenarios.imu_health import GRAVITY, frozen_gyro, still_prefix
+
+_SLOWER = 3.0  # a pause of so many usual intervals is one in which readings are missing
+_AT_THE_END = 0.75  # of a smooth signal's extreme and next value: an arc sine has 0.71 at its extreme
+_RESTING = 0.05  # rad/s: more than that is no bias that was left over
+_HELD = 0.05  # the share of readings that repeat the one before, where they are held
+
+
+class Given(NamedTuple):
+    """A sensor's readings (M, n) and the rows (M,) of the run at which they came; raw ones where there are any."""
+
+    rows: np.ndarray
+    values: Array
+
+
+def given(run: Run) -> dict[str, Given]:
+    """By sensor what it gave; raw counts rather than what was made of them."""
+    found = {}
+    for kind in ("z.", "raw."):
+        for name, values in run.inputs.items():
+            if name.startswith(kind):
+                rows = np.flatnonzero(np.isfinite(values).all(1))
+                if len(rows):
+                    found[name.removeprefix(kind)] = Given(rows, values[rows])
+    return found
+
+
+class Imu(NamedTuple):
+    """rate (T, 3) rad/s as the filter reads it, force (T, 3) m/s² or its direction times g; rows (T,) of the run."""
+
+    rows: np.ndarray
+    rate: Array
+    force: Array
+
+
+def imu(run: Run) -> Imu | None:
+    """The run's gyro and accelerometer, where both are read; the gyro may drive the prediction as its control."""
+    force, rate = run.inputs.get("z.accel"), run.inputs.get("z.gyro")
+    if rate is None and "raw.gyro" in run.inputs:
+        rate = _driving(run)
+    if force is None or rate is None or force.shape[1:] != (3,) or rate.shape[1:] != (3,):
+        return None
+    rows = np.flatnonzero(np.isfinite(force).all(1) & np.isfinite(rate).all(1))
+    if len(rows) < 20:
+        return None
+    length = np.median(np.linalg.norm(force[rows], axis=1))
+    return Imu(rows, rate[rows], force[rows] * (GRAVITY if abs(length - 1) < 0.05 else 1.0))
+
+
+def _driving(run: Run) -> Array | None:
+    """The gyro's rates, where they are the control: also where the filter took another rate for them."""
+    rate, raw = run.inputs.get("control"), run.inputs["raw.gyro"]
+    if rate is None or rate.shape != raw.shape:
+        return None
+    known = np.isfinite(rate).all(1) & np.isfinite(raw).all(1) & (rate != 0).all(1)
+    if known.sum() < 2:
+        return None
+    found = [np.polyfit(raw[known, i], rate[known, i], 1) for i in range(rate.shape[1])]
+    return np.stack([np.polyval(fit, raw[:, i]) for i, fit in enumerate(found)], axis=1)
+
+
+def frozen(run: Run) -> Iterator[Finding]:
+    """A gyro that is flat while gravity turns (`imu_health.frozen_gyro`), and any sensor whose readings repeat.
+
+    Of a sensor as fine as a float, n equal readings in a row come by chance with N·qⁿ⁻¹, q the share of equal
+    neighbours elsewhere, at least 1/N.
+    """
+    both = imu(run)
+    if both is not None:
+        flags = frozen_gyro(run.time[both.rows], both.rate, both.force, np.zeros(3))
+        for first, last in _runs(flags):
+            yield _stuck(run, "gyro", both.rows[first], both.rows[last], {"level": both.rate[first : last + 1].mean(0)})
+    sensors = given(run)
+    for name, (rows, values) in sensors.items():
+        if not _continuous(values):
+            continue
+        same = (np.diff(values, axis=0) == 0).all(1)
+        for first, last in _runs(same):
+            n = last - first + 2
+            elsewhere = max((same.sum() - (n - 1)) / len(same), 1 / len(same))
+            p = len(same) * elsewhere ** (n - 1)
+            if n >= 5 and p < level("error", len(sensors)):
+                yield _stuck(run, name, rows[first], rows[last + 1], {"level": values[first]})
+
+
+def _stuck(run: Run, name: str, first: int, last: int, evidence: dict[str, Array]) -> Finding:
+    steps, span = (int(run.step[first]), int(run.step[last])), float(run.time[last] - run.time[first])
+    left_out = _left_out(run, name, steps)
+    begin, end = float(run.time[first]), float(run.time[last])
+    what = f"the {name} sticks at one value for {span:.2f} s (from {begin:.2f} to {end:.2f} s) while the body moves"
+    remedy = (
+        "the filter leaves it out already; look whether its uncertainty grows meanwhile"
+        if left_out
+        else "leave it out in that time (`frozen=reject` where the scenario has it), or read a stand-in of large noise"
+    )
+    shown = {"level": [float(v) for v in evidence["level"]], "from_s": begin, "to_s": end, "left_out": left_out}
+    return Finding("sensor_frozen", "note" if left_out else "error", name, steps, shown, what, remedy)
+
+
+def _left_out(run: Run, name: str, steps: tuple[int, int]) -> bool:
+    """Whether the filter took no reading of the sensor for good in most of these steps."""
+    for table in run.stages.values():
+        if name in getattr(table.spaces.get("innovation"), "parts", ()):
+            i = list(table.spaces["innovation"].parts).index(name)  # type: ignore[attr-defined]
+            rows = (table.step >= steps[0]) & (table.step <= steps[1])
+            return bool((table.values["innovation.offered"][rows, i] == 0).mean() > 0.5) if rows.any() else False
+    control = run.inputs.get("control")
+    rows = (run.step >= steps[0]) & (run.step <= steps[1])
+    return control is not None and bool((control[rows] == 0).all())
+
+
+def silent(run: Run) -> Iterator[Finding]:
+    """A pause in a sensor's readings: regular ones, of three usual intervals; irregular ones, by the chance of it.
+
+    Regular: nineteen of twenty intervals are at most 1.5 medians. Else arrivals are taken as a Poisson process, whose
+    longest of N pauses of mean μ exceeds g with 1 − (1 − e^(−g/μ))ᴺ.
+    """
+    sensors = given(run)
+    for name, (rows, _) in sensors.items():
+        if len(rows) < 10:
+            continue
+        gaps = np.diff(np.append(rows, len(run.step)))  # up to the run's end: there it is silent for good
+        usual = float(np.median(gaps))
+        regular = float(np.quantile(gaps, 0.95)) <= 1.5 * usual
+        longest = int(np.argmax(gaps))
+        p = float(-np.expm1(len(gaps) * np.log1p(-np.exp(-gaps[longest] / gaps.mean()))))
+        if regular:
+            found = np.flatnonzero(gaps > max(_SLOWER * usual, usual + 2))
+        else:
+            found = np.array([longest]) if judge(p, len(sensors), large=False) else np.array([], int)
+        for k in found[:20]:
+            first, end = int(rows[k]) + 1, int(rows[k]) + int(gaps[k])
+            last = min(end, len(run.step)) - 1
+            for_good = end >= len(run.step)
+            span = float(run.time[last] - run.time[rows[k]])
+            steps = int(run.step[first]), int(run.step[last])
+            evidence = {"pause_s": span, "usual_steps": usual, "for_good": for_good}
+            yield Finding(
+                "sensor_silent", "error" if for_good and gaps[k] > 10 * usual else "warning", name, steps, evidence,
+                f"the {name} gives no reading for {span:.3g} s"
+                + (", to the end of the run" if for_good else f", {gaps[k] / usual:.0f} of its usual intervals"),
+                "check the log and the wiring for lost messages; look whether the covariance grows meanwhile",
+            )  # fmt: skip
+
+
+def saturated(run: Run, without: Sequence[tuple[int, int]] = ()) -> Iterator[Finding]:
+    """Readings that pile up at a component's largest or smallest value: more of them than at the next value inside.
+
+    without: intervals of steps (first, last) to leave out. Binomial: of the readings at the extreme and within one
+    quantum of it, a smooth signal has at most 3 of 4 there.
+    """
+    sensors = {name: _left_of(run, one, without) for name, one in given(run).items()}
+    tests = 2 * sum(values.shape[1] for _, values in sensors.values())
+    for name, (rows, values) in sensors.items():
+        for i in range(values.shape[1]):
+            for sign, end in ((1, "largest"), (-1, "smallest")):
+                x = sign * values[:, i]
+                distinct = np.unique(x)
+                if len(distinct) < 20:
+                    continue
+                top = x == distinct[-1]
+                near = (x >= distinct[-1] - _quantum(distinct) * 1.5) | top
+                count, around = int(top.sum()), int(near.sum()) + 1
+                moving = (np.diff(x, prepend=np.nan) != 0) | (np.diff(x, append=np.nan) != 0)
+                p = float(binom.sf(count - 1, around, _AT_THE_END))
+                severity = judge(p, tests, large=count > 0.02 * len(x))
+                if severity and count >= 10 and moving[top].any():
+                    at = rows[np.flatnonzero(top)]
+                    steps = int(run.step[at[0]]), int(run.step[at[-1]])
+                    value = float(values[np.flatnonzero(top)[0], i])
+                    evidence = {"component": i, "value": value, "readings": count, "p": p}
+                    yield Finding(
+                        "sensor_saturated", severity, name, steps, evidence,
+                        f"{count} readings of {name} (component {i}) are exactly {value:g}, its {end}: the sensor is "
+                        "at the end of its range and clips what lies beyond",
+                        "take a wider range, or leave those readings out: a clipped reading is no reading with noise",
+                    )  # fmt: skip
+
+
+def _left_of(run: Run, one: Given, without: Sequence[tuple[int, int]]) -> Given:
+    """The readings outside intervals of steps (first, last)."""
+    step = run.step[one.rows]
+    fine = ~np.any([(step >= first) & (step <= last + 2) for first, last in without] or [np.zeros(len(step), bool)], 0)
+    return Given(one.rows[fine], one.values[fine])
+
+
+def used_twice(run: Run) -> Iterator[Finding]:
+    """One reading taken in twice: by two updates of a step, or held and given again at the next tick."""
+    seen: dict[tuple[str, int], list[Array]] = {}
+    twice: dict[str, set[int]] = {}
+    for table in run.stages.values():
+        if "innovation.z" in table.values:
+            space = as_product(table.spaces["innovation"])
+            for i, name in enumerate(space.parts):
+                offered = table.values["innovation.offered"][:, i] > 0
+                z = table.values["innovation.z"][:, space.at[name]]
+                for row in np.flatnonzero(offered):
+                    known = seen.setdefault((name, int(table.step[row])), [])
+                    if any(np.array_equal(z[row], other) for other in known):
+                        twice.setdefault(name, set()).add(int(table.step[row]))
+                    known.append(z[row])
+    for name, steps in twice.items():
+        yield _twice(name, (min(steps), max(steps)), len(steps), "at one step two updates take in the same reading")
+    for name, (rows, values) in given(run).items():
+        if name in twice or not _continuous(values):
+            continue
+        same = (np.diff(values, axis=0) == 0).all(1)
+        short = np.zeros(len(same), bool)
+        for first, last in _runs(same):
+            short[first : last + 1] = (last - first) < len(same) / 10
+        if short.mean() > _HELD:
+            at = np.flatnonzero(short) + 1
+            steps_held = int(run.step[rows[at[0]]]), int(run.step[rows[at[-1]]])
+            yield _twice(name, steps_held, len(at), "a reading is held and given again until the next one comes")
+
+
+def _twice(name: str, steps: tuple[int, int], count: int, how: str) -> Finding:
+    return Finding(
+        "used_twice", "error", name, steps, {"times": count},
+        f"{how}: {count} readings of {name} count double, so that the covariance is too small",
+        f"take each reading of {name} in once: update only at ticks at which a new one came",
+    )  # fmt: skip
+
+
+def biased_at_rest(run: Run) -> Iterator[Finding]:
+    """A gyro that reads a rate while it lies still: its mean over the prefix's first half, by a t-test.
+
+    Only where its readings are white, as those of a body at rest are.
+    """
+    both = imu(run)
+    if both is None:
+        return
+    still = still_prefix(run.time[both.rows], both.rate, both.force) // 2
+    if still < 20:
+        return
+    rest = both.rate[:still]
+    about = rest - rest.mean(0)
+    rho = (about[1:] * about[:-1]).sum(0) / np.maximum((about**2).sum(0), 1e-300)
+    if (np.abs(rho) > 3 / np.sqrt(still)).any() or np.abs(rest.mean(0)).max() > _RESTING:
+        return  # readings that follow one another: it turns, however slowly
+    error = rest.std(0, ddof=1) / np.sqrt(still)
+    score = rest.mean(0) / np.where(error > 0, error, np.inf)
+    worst = int(np.argmax(np.abs(score)))
+    p = float(2 * t.sf(abs(score[worst]), still - 1))
+    severity = judge(p, 3, large=False)
+    if severity:
+        value, axis = float(rest.mean(0)[worst]), "xyz"[worst]
+        steps = int(run.step[both.rows[0]]), int(run.step[both.rows[still - 1]])
+        evidence = {"component": axis, "mean": value, "z": float(score[worst]), "p": p}
+        yield Finding(
+            "biased_innovation", severity, "gyro", steps, evidence,
+            f"lying still, the gyro's {axis} reads {value:+.2g} rad/s ({np.degrees(value) * 30:+.1f}° in 30 s): its "
+            "bias is not what was subtracted, as when it is read off by the median of whole counts",
+            "subtract the mean of the still prefix, not the median, and no constant from another day",
+        )  # fmt: skip
+
+
+def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """The runs of True in flags (T,), as first and last index, both inclusive."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
+    return [(int(first), int(end) - 1) for first, end in edges]
+
+
+def _quantum(distinct: Array) -> float:
+    """The smallest step between a component's sorted distinct values."""
+    steps = np.diff(distinct)
+    steps = steps[steps > 1e-9 * max(np.ptp(distinct), 1e-300)]
+    return float(steps.min()) if len(steps) else 0.0
+
+
+def _continuous(values: Array) -> bool:
+    """Whether readings (M, n) are so fine that none is met twice by chance: their steps are no multiples of one."""
+    for x in values.T:
+        distinct = np.unique(x)
+        quantum = _quantum(distinct)
+        if quantum and len(distinct) > 10:
+            steps = np.diff(distinct) / quantum
+            if np.abs(steps - np.round(steps)).mean() > 0.1:  # a quarter, where there is no grid
+                return True
+    return False

@@ -1,0 +1,242 @@
+"""What a fault of a sensor would do to the innovations, carried through the filter's own gains: bias and lag.
+
+Willsky and Jones (1976), the generalised likelihood ratio test. A fault δ_k of a reading leaves in the innovation
+s_k = δ_k − H·g_k, where g is how far the fault has moved the estimate: g⁺ = g + K·s, g' = F·g. The innovations are
+white if the filter is right, so that the fault's size is estimated by b/A, with A = Σ sᵀS⁻¹s and b = Σ sᵀS⁻¹ν, and
+b/√A is N(0, 1) where there is no fault. Where innovations are coloured the sum b scatters more: by how much its parts
+in 20 stretches of the run say (a cluster-robust variance; Liang and Zeger 1986), and the larger p of the two counts. A
+fault that the state soaks up (a constant lag while driving straight) is found by what is left of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.stats import chi2, norm, t
+
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import Product, Space
+from viz_estim.diagnosis.evidence import Case, parameter
+from viz_estim.diagnosis.finding import Finding, judge
+from viz_estim.recording.tables import StageTable
+
+_BACK = 3  # readings over which a rate of change is taken: backwards, so that it is known before the innovation
+_STRETCHES = 20
+_EXPLAINS = 0.2  # of the innovations' excess over what they should be, at least, for a fault to be named as its cause
+
+
+class Fault(NamedTuple):
+    """A fault's sensor (`range/1`), what it is, its estimated size, its score, and the chance of such a score."""
+
+    sensor: str
+    kind: str
+    size: float
+    score: float
+    p: float
+
+
+def lags(case: Case) -> Iterator[Finding]:
+    """A constant lag τ of a sensor: its readings are z(t − τ), off by −τ·ż."""
+    found = _tested(case, "lag")
+    excess = _excess(case)
+    for fault in found:
+        severity = judge(fault.p, len(found), large=True)
+        tau, name = fault.size, fault.sensor
+        interval = float(np.median(np.diff(case.run.time)))
+        if severity is None or fault.score**2 < _EXPLAINS * excess or abs(tau) < interval:
+            continue  # less than a step is how the model takes its steps
+        late = "late" if tau > 0 else "early"
+        yield Finding(
+            "lag", severity, name.partition("/")[0], case.whole,
+            {"lag_s": tau, "lag_samples": tau / max(interval, 1e-12), "z": fault.score, "p": fault.p},
+            f"readings of {name} come {abs(tau):.3g} s {late} against the rest ({abs(tau) / max(interval, 1e-12):.1f} "
+            "samples): a delay of the sensor, another clock, or an index that is one off",
+            f"pair {name} by its stamps and not by index; correct its stamps by {-tau:+.3g} s",
+        )  # fmt: skip
+
+
+def biases(case: Case) -> Iterator[Finding]:
+    """A constant bias of one component of a sensor, also where the state soaks up most of it."""
+    found = _tested(case, "bias")
+    excess = _excess(case)
+    told = set()
+    for fault in sorted(found, key=lambda one: -abs(one.score)):
+        name = fault.sensor.partition("/")[0]
+        severity = judge(fault.p, len(found), large=True)
+        if severity is None or name in told or fault.score**2 < _EXPLAINS * excess:
+            continue
+        told.add(name)
+        axis, unit = fault.kind.removeprefix("bias ").partition(" ")[::2]
+        known = parameter(case.run, f"{name}_bias")
+        remedy = (
+            f"set {known[0]}=estimate"
+            if known
+            else f"subtract it by a calibration, or add a bias of {name} to the state"
+        )
+        yield Finding(
+            "biased_innovation", severity, name, case.whole,
+            {"component": axis, "bias": fault.size, "z": fault.score, "p": fault.p},
+            f"a constant bias of {fault.size:+.3g} {unit} in {fault.sensor} ({axis}) explains the innovations, which "
+            "the state soaks up in part",
+            remedy,
+        )  # fmt: skip
+
+
+def _excess(case: Case) -> float:
+    """By how much the sum of all NIS is above its mean."""
+    return max(0.0, sum(float(r.nis.sum()) - r.dof * len(r) for r in case.sensors.values()))
+
+
+def _tested(case: Case, kind: str) -> list[Fault]:
+    found = getattr(case, "_faults", None)
+    if found is None:
+        found = faults(case)
+        object.__setattr__(case, "_faults", found)
+    return [fault for fault in found if fault.kind.startswith(kind)]
+
+
+def faults(case: Case) -> list[Fault]:
+    """All faults that the run is tested for; none where its stages do not say how the state moves on."""
+    if case.run.labels:
+        return []
+    moves, updates = {}, {}
+    for name, table in case.run.stages.items():
+        if (F := transitions(case, table)) is not None:
+            moves[name] = F
+        elif "innovation.cross_cov" in table.values:
+            updates[name] = _Update(case, table)
+        elif name != "start" and "mean" in table.values and name.startswith("predict"):
+            return []
+    kinds: list[tuple[str, str, Space]] = []
+    for update in updates.values():
+        for name, part in update.space.parts.items():
+            units = part.axis_units
+            kinds += [
+                (name, f"bias {a if a != name else 'reading'} {u}", part) for a, u in zip(part.axes, units, strict=True)
+            ]
+            kinds.append((name, "lag", part))
+    kinds = list({(name, kind): (name, kind, part) for name, kind, part in kinds}.values())
+    column = {(name, kind): j for j, (name, kind, _) in enumerate(kinds)}
+    if not kinds or len(kinds) > 40:
+        return []
+    q, d = len(kinds), len(case.space.axes)
+    for update in updates.values():
+        update.prepare(column, q)
+    g, A, b = np.zeros((d, q)), np.zeros((_STRETCHES, q)), np.zeros((_STRETCHES, q))
+    places = len(case.sequence.stage)
+    for place, stage in enumerate(case.sequence.stage):
+        if stage is None:
+            continue
+        table, row = stage
+        if table.name in moves:
+            g = moves[table.name][row] @ g
+        elif table.name in updates:
+            update = updates[table.name]
+            if update.sound[row]:
+                s = update.delta[row] - update.H[row] @ g
+                if update.counts[row]:
+                    w = update.inverse[row] @ s
+                    stretch = place * _STRETCHES // places
+                    A[stretch] += np.einsum("mq,mq->q", s, w)
+                    b[stretch] += update.residual[row] @ w
+                g = g + update.gain[row] @ s
+        else:
+            g = np.zeros((d, q))
+    if not np.isfinite(A).all():
+        return []
+    misfit = max(1.0, _misfit(case))
+    return [
+        _estimated(name, kind, A[:, j], b[:, j], misfit)
+        for j, (name, kind, _) in enumerate(kinds)
+        if A[:, j].sum() > 1e-12
+    ]
+
+
+def _estimated(name: str, kind: str, A: Array, b: Array, misfit: float) -> Fault:
+    """The fault from its sums by stretch (B,)."""
+    size = b.sum() / A.sum()
+    score = float(b.sum() / np.sqrt(A.sum() * misfit))
+    used = int((A > 0).sum())
+    rest = (b - size * A)[A > 0]
+    scatter = np.sqrt(np.square(rest).sum() * used / max(used - 1, 1))
+    p = max(2 * norm.sf(abs(score)), 2 * t.sf(abs(b.sum()) / max(scatter, 1e-300), max(used - 1, 1)))
+    return Fault(name, kind, float(size), score, float(p))
+
+
+def _misfit(case: Case) -> float:
+    """How much larger the innovations are than S says, in the middle: outliers don't count."""
+    ratios = [float(np.median(r.nis)) / chi2.median(r.dof) for r in case.sensors.values()]
+    return max(ratios, default=1.0)
+
+
+class _Update:
+    """One update stage's rows as arrays: H, gain, S⁻¹, residual, and δ (M, m, q) of each fault at unit size."""
+
+    def __init__(self, case: Case, table: StageTable) -> None:
+        space = table.spaces["innovation"]
+        assert isinstance(space, Product)
+        self.space, self.table, self.case = space, table, case
+        get = table.values
+        _, P = case.sequence.before(table)
+        S = get["innovation.cov"]
+        self.residual, self.gain = get["innovation.residual"], get["gain"]
+        self.sound = np.asarray(np.isfinite(P).all((1, 2)) & np.isfinite(S).all((1, 2)))
+        self.sound[self.sound] &= np.linalg.cond(S[self.sound]) < 1e14
+        d, m = get["innovation.cross_cov"].shape[1:]
+        self.H, self.inverse = np.zeros((len(P), m, d)), np.zeros((len(P), m, m))
+        ok = self.sound
+        cross = get["innovation.cross_cov"][ok]
+        self.H[ok] = np.swapaxes(_solved(P[ok], cross), 1, 2)
+        self.inverse[ok] = np.linalg.solve(S[ok], np.broadcast_to(np.eye(m), S[ok].shape))
+        self.offered: np.ndarray = get["innovation.offered"] > 0
+        whole = self.offered.all(1)
+        known = {int(step) for readings in case.sensors.values() for step in readings.step}
+        self.counts: np.ndarray = whole & np.array([int(step) in known for step in table.step], bool)
+
+    def prepare(self, column: dict[tuple[str, str], int], q: int) -> None:
+        predicted = self.table.values["innovation.predicted"]
+        time = self.case.run.time[np.searchsorted(self.case.run.step, self.table.step)]
+        self.delta = np.zeros((len(time), len(self.space.axes), q))
+        for i, (name, part) in enumerate(self.space.parts.items()):
+            axes, at = self.space.axes_at[name], self.space.at[name]
+            for k, (axis, unit) in enumerate(zip(part.axes, part.axis_units, strict=True)):
+                j = column[name, f"bias {axis if axis != name else 'reading'} {unit}"]
+                self.delta[:, axes.start + k, j] = self.offered[:, i]
+            back = min(_BACK, len(time) - 1)
+            rate = np.zeros((len(time), axes.stop - axes.start))
+            if back:
+                spans = np.maximum(time[back:] - time[:-back], 1e-9)[:, None]
+                rate[back:] = part.minus(predicted[back:, at], predicted[:-back, at]) / spans
+            self.delta[:, axes, column[name, "lag"]] = -rate * self.offered[:, i, None]
+
+
+def _solved(P: Array, C: Array) -> Array:
+    """P⁻¹·C (M, d, m); by the pseudo-inverse where P is singular."""
+    if (np.linalg.cond(P) < 1e13).all():
+        return np.asarray(np.linalg.solve(P, C), float)
+    solved: Array = np.linalg.pinv(P, rcond=1e-12, hermitian=True) @ C
+    return solved
+
+
+def transitions(case: Case, table: StageTable) -> Array | None:
+    """F (M, d, d) of a prediction: as recorded, or by least squares over its sigma points."""
+    if "transition" in table.values and table.values["transition"].shape[1:] == case.run.cov.shape[1:]:
+        return table.values["transition"]
+    drawn, moved = table.values.get("drawn.points"), table.values.get("propagated.points")
+    if drawn is None or moved is None or np.isnan(drawn).any() or np.isnan(moved).any():
+        return None
+    space: Any = case.space
+    mean, _ = case.sequence.before(table)
+    d, extra = len(space.axes), drawn.shape[-1] - len(space.names)
+    x = space.minus(drawn[..., : len(space.names)], mean[:, None, :])
+    if extra:  # noise among the points
+        x = np.concatenate([x, drawn[..., len(space.names) :]], axis=-1)
+    y = space.minus(moved, table.mean[:, None, :])
+    # Scaled, since states of very unlike size would lose the small ones.
+    size = np.maximum(np.abs(x).max(1, keepdims=True), 1e-12)
+    x = x / size
+    xT = np.swapaxes(x, 1, 2)
+    fit = np.linalg.pinv(xT @ x, rcond=1e-10, hermitian=True) @ (xT @ y)
+    return np.swapaxes(fit / np.swapaxes(size, 1, 2), 1, 2)[:, :, :d]
