@@ -7,6 +7,7 @@ import pytest
 
 import viz_estim
 from viz_estim.cli import main
+from viz_estim.diagnosis.finding import CODES
 from viz_estim.recording import schema
 from viz_estim.scenarios import SCENARIOS
 
@@ -57,3 +58,7 @@ def test_the_generated_set_is_what_simulate_writes(tmp_path: Path) -> None:
     made, kept = (imu_files.load(*imu_files.find_sets([folder])[0]) for folder in (tmp_path, ROOT / "data" / "imu"))
     assert (made.gyro == kept.gyro).all()
     assert (made.truth_stamps == kept.truth_stamps).all()
+
+
+def test_its_table_of_codes_is_that_of_diagnose() -> None:
+    assert all(f"| `{code}` | {meaning} |" in README for code, meaning in CODES.items())

@@ -114,7 +114,7 @@ class Chance:
 def run(scenario: Scenario, seed: int = 0, *, first: int = 0, belief: Belief | None = None) -> Iterator[Step]:
     """The scenario's steps, one a tick, or fewer: the last one carries a failure where the estimator raised one.
 
-    first, belief: to begin with that step, given what was believed before it; the steps are then those of the whole run.
+    first, belief: to begin with that step, given what was believed before it; the steps are then the whole run's.
     """
     chance = Chance(seed)
     # A person's own kind of belief may lack them: then its first stage says so.

@@ -191,6 +191,7 @@ ENTITIES = (
     Entry("/plots/probability/labels", "`Measurements`: the probability of each label", "1"),
     Entry("/lanes/stage, /lanes/truth", "`StateChange`: the stage; the true label"),
     Entry("/lanes/{sensor}", "`StateChange`: its reading was used, gated, frozen or absent"),
+    Entry("/findings, /findings/list, /lanes/NN_…", "`TextDocument`, `TextLog`, `StateChange`: what `diagnose` found"),
     Entry(EVENTS, "`TextLog`: what ended a run"),
     Entry(NOTES, "`TextDocument`: what to look at"),
     Entry("/runs/{run}/…", "in a comparison: a run's own entities, on the first run's steps and stages"),
