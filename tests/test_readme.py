@@ -1,5 +1,6 @@
 """The README holds what it says: its table is the schema's, its filter runs, its sample opens."""
 
+import io
 import re
 from pathlib import Path
 
@@ -19,8 +20,10 @@ def test_its_table_of_entities_is_made_from_the_schema() -> None:
     assert schema.table() in README
 
 
-def test_its_filter_runs_and_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+def test_its_filter_runs_is_recorded_and_stepped_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (code,) = [code for code in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if "def walk" in code]
     (tmp_path / "walk.py").write_text(code, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     assert main(["run", "walk.py:walk"]) == 0
@@ -28,6 +31,9 @@ def test_its_filter_runs_and_is_recorded(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(run.step) == 200
     assert run.summary()["metrics"]["position_rmse_m"] < 0.4
     assert 0.8 < run.summary()["nees"]["inside"] <= 1.0
+    monkeypatch.setattr("sys.stdin", io.StringIO("step 3\nwhere\nquit\n"))
+    assert main(["debug", "walk.py:walk", "--no-viewer"]) == 0
+    assert "step 3  update" in capsys.readouterr().out
 
 
 SAMPLES = sorted((ROOT / "recordings").glob("*-sample.rrd"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import threading
 import time
 from collections.abc import Iterable, Mapping
@@ -69,7 +70,8 @@ class Recorder:
         self._closed = threading.Event()
         name = str(properties.get("scenario", path.stem))
         # A view belongs to an application id: runs of one scenario share what a person arranges in the viewer.
-        self._stream = rr.RecordingStream(f"viz_estim {name}", send_properties=False)
+        plain = re.sub(r"[^A-Za-z0-9_-]+", "-", name)  # Rerun renames others, and says so
+        self._stream = rr.RecordingStream(f"viz_estim {plain}", send_properties=False)
         self._stream.set_sinks(rr.FileSink(self.partial), *([rr.GrpcSink(live)] if live else []))
         self._stream.send_recording_name(str(properties.get("title", name)))
         self._stream.flush()  # what is logged so far comes before all columns

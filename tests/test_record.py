@@ -1,0 +1,348 @@
+"""Code that is no scenario, recorded: a person's own loop, FilterPy's filters, Stone Soup's predictor and updater."""
+
+import datetime
+import io
+import json
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Cli
+from filterpy.kalman import (  # type: ignore[import-untyped]
+    ExtendedKalmanFilter,
+    KalmanFilter,
+    MerweScaledSigmaPoints,
+    UnscentedKalmanFilter,
+)
+
+import viz_estim
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import SO2, SO3, Euclidean, Product
+
+F = np.array([[1.0, 0.1], [0.0, 1.0]])
+Names = dict[str, str]
+STATE: Names = {"x": "m", "v": "m/s"}
+
+
+def readings(count: int = 60, seed: int = 0) -> tuple[Array, Array]:
+    """The true states (T, 2) of something that moves evenly, and noisy readings (T, 1) of where it is."""
+    rng = np.random.default_rng(seed)
+    truth = np.stack([0.1 * np.arange(count), np.ones(count)], axis=1)
+    return truth, truth[:, :1] + 0.5 * rng.standard_normal((count, 1))
+
+
+def own_loop(path: Path, *, every: int = 1, fails: int | None = None) -> tuple[list[Array], list[Array]]:
+    """A Kalman filter as a person writes it, in place; returns the beliefs at the end of each step."""
+    truth, z = readings()
+    x, P = np.zeros((2, 1)), np.eye(2)
+    means, covs = [], []
+    with viz_estim.record(path, STATE, sensors={"gps": {"x": "m"}}) as rec:
+        for k in range(60):
+            if k:
+                x[:] = F @ x
+                P[:] = F @ P @ F.T + 0.01 * np.eye(2)
+                rec.stage("predict", mean=x, cov=P)
+            if k == fails:
+                np.linalg.cholesky(-P)
+            if k % every == 0:
+                y, S = z[k] - x[0], P[:1, :1] + 0.25
+                K = P[:, :1] / S
+                x += K @ y[:, None]
+                P -= K @ S @ K.T
+                rec.stage("update", mean=x, cov=P, residual=y, residual_cov=S, gain=K, sensor="gps", z=z[k], noise=0.25)
+            rec.step(time=0.1 * k, truth=truth[k])
+            means.append(x[:, 0].copy())
+            covs.append(P.copy())
+    return means, covs
+
+
+def test_what_is_told_is_kept_to_the_bit(tmp_path: Path) -> None:
+    means, covs = own_loop(tmp_path / "own.rrd", every=3)
+    run = viz_estim.load(tmp_path / "own.rrd")
+    assert run.complete
+    np.testing.assert_array_equal(run.mean, means)
+    np.testing.assert_array_equal(run.cov, covs)
+    np.testing.assert_array_equal(run.truth, readings()[0])
+    assert {name: len(table.step) for name, table in run.stages.items()} == {"predict": 59, "update": 20}
+    assert (run.space.names, run.space.units) == (("x", "v"), ("m", "m/s"))
+    nis = run.summary()["nis"]["gps"]
+    assert nis["dof"] == 1
+    residual, S = (run.stages["update"].values[f"innovation.{k}"] for k in ("residual", "cov"))
+    assert nis["mean"] == pytest.approx((residual[:, 0] ** 2 / S[:, 0, 0]).mean())
+    assert 0 < run.summary()["metrics"]["state_rmse_m"] < 2 if "state_rmse_m" in run.summary()["metrics"] else True
+    np.testing.assert_array_equal(run.stages["update"].values["innovation.z"][:, 0], readings()[1][::3, 0])
+
+
+def test_it_opens_shows_compares_and_debugs_like_any_other(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    own_loop(tmp_path / "a.rrd")
+    own_loop(tmp_path / "b.rrd", every=2)
+    shown = json.loads(cli("show", "a.rrd", "--step", 9, "--json").out)
+    assert [stage["name"] for stage in shown["stages"]] == ["predict", "update"]
+    assert "moved" in shown["stages"][1]
+    assert "NIS gps" in cli("show", "a.rrd").out
+    same, other = cli("compare", "a.rrd", "a.rrd", "--json"), cli("compare", "a.rrd", "b.rrd", "--json")
+    assert (same.code, other.code) == (0, 1)
+    assert cli("diagnose", "a.rrd", "--json").code in (0, 1)
+    assert cli("export", "a.rrd", "--to", "csv", "-o", "a.csv").code == 0
+    monkeypatch.setattr("sys.stdin", io.StringIO("break nis.gps > 1\nc\nwhy\nprint mean.x\nset q=1\nstage back\nwhy\n"))
+    done = cli("debug", "a.rrd", "--no-viewer")
+    assert (done.code, done.err) == (0, "")
+    assert "gps.x  ν" in done.out
+    assert "mean.x = " in done.out
+    assert "error: a.rrd: recorded by viz_estim.record: there is no scenario" in done.out
+    forked = cli("fork", "a.rrd", "--at", 3, "--set", "q=1")
+    assert (forked.code, forked.err.count("\n")) == (2, 1)
+
+
+@pytest.mark.draws
+def test_it_draws(cli: Cli, tmp_path: Path) -> None:
+    space = Product(position=Euclidean(("x", "y"), "m"), heading=SO2())
+    with viz_estim.record(tmp_path / "a.rrd", space, sensors={"gps": Euclidean(("x", "y"), "m")}) as rec:
+        for k in range(30):
+            x, P = np.array([np.cos(k / 9), np.sin(k / 9), k / 9]), 0.1 * np.eye(3)
+            rec.stage("predict", mean=x, cov=P)
+            rec.stage("update", mean=x, cov=P, residual=[0.1, -0.1], residual_cov=np.eye(2), sensor="gps")
+            rec.step(time=k, truth=x + 0.1 if k > 5 else [np.nan] * 3)
+    done = cli("snapshot", tmp_path / "a.rrd", "--step", 20, "--size", "800x600", "-o", tmp_path / "a.png")
+    assert (done.code, done.err) == (0, "")
+    run = viz_estim.load(tmp_path / "a.rrd")
+    assert np.isnan(run.truth[:6]).all()
+    assert np.isfinite(run.truth[6:]).all()
+
+
+def test_a_group_s_state_has_more_numbers_than_directions(tmp_path: Path) -> None:
+    with viz_estim.record(tmp_path / "a.rrd", Product(attitude=SO3())) as rec:
+        rec.stage("predict", mean=[1, 0, 0, 0], cov=np.eye(3))
+        rec.step(time=0, truth=[1, 0, 0, 0])
+    assert viz_estim.load(tmp_path / "a.rrd").summary()["metrics"]["attitude_rmse_deg"] == 0.0
+
+
+def test_without_names_components_are_counted(tmp_path: Path) -> None:
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        rec.stage("update", mean=3.0, cov=1.0, residual=0.5, residual_cov=2.0, gain=0.3)
+        rec.step(time=0)
+    run = viz_estim.load(tmp_path / "a.rrd")
+    assert run.space.names == ("x0",)
+    assert run.stages["update"].spaces["innovation"].names == ("z.z",)
+
+
+def test_an_exception_is_the_run_s_failure(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.rrd"
+    with pytest.raises(np.linalg.LinAlgError):
+        own_loop(path, fails=20)
+    run = viz_estim.load(path)
+    assert len(run.step) == 21
+    assert run.properties["result"]["error"] | {"message": ""} == {"step": 20, "stage": "after predict", "message": ""}
+    monkeypatch.setattr("sys.stdin", io.StringIO("back\n"))
+    told = cli("debug", path, "--no-viewer").out.splitlines()
+    assert told[0].startswith("step 20  predict")
+    assert told[1].startswith("FAILED in after predict: LinAlgError")
+
+
+BAD: dict[str, tuple[Callable[[Any], object], str]] = {
+    "a mean of another length": (lambda rec: rec.stage("p", mean=[1, 2, 3], cov=np.eye(2)), "mean: expected"),
+    "a cov of another shape": (lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(3)), "cov: expected"),
+    "a residual alone": (lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), residual=[1]), "together"),
+    "a gain that does not fit": (
+        lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), residual=[1], residual_cov=1, gain=np.eye(3)),
+        "gain: expected the shape (2, 1), got (3, 3)",
+    ),
+    "a stage that is no name": (lambda rec: rec.stage("a b", mean=[1, 2], cov=np.eye(2)), "a stage's name is of"),
+    "a step without a stage": (lambda rec: rec.step(time=3), "tell of a stage"),
+    "a step in the past": (
+        lambda rec: [rec.stage("p", mean=[1, 2], cov=np.eye(2)), rec.step(time=-1)],
+        "time -1 is not after",
+    ),
+    "a truth of another length": (
+        lambda rec: [rec.stage("p", mean=[1, 2], cov=np.eye(2)), rec.step(time=1, truth=[1])],
+        "truth: expected",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_what_does_not_fit_is_refused(what: str, tmp_path: Path) -> None:
+    wrong, words = BAD[what]
+    with viz_estim.record(tmp_path / "a.rrd", STATE) as rec:
+        rec.stage("predict", mean=[0, 1], cov=np.eye(2))
+        rec.step(time=0)
+        with pytest.raises(ValueError, match=words.replace("(", r"\(").replace(")", r"\)")):
+            wrong(rec)
+
+
+def linear() -> Any:
+    kf = KalmanFilter(2, 1)
+    kf.F, kf.H, kf.R, kf.Q = F.copy(), np.array([[1.0, 0.0]]), np.array([[0.25]]), 0.01 * np.eye(2)
+    return kf
+
+
+def extended() -> Any:
+    kf = ExtendedKalmanFilter(2, 1)
+    kf.F, kf.R, kf.Q = F.copy(), np.array([[0.25]]), 0.01 * np.eye(2)
+    return kf
+
+
+def unscented() -> Any:
+    points = MerweScaledSigmaPoints(2, 0.5, 2.0, 1.0)
+    kf = UnscentedKalmanFilter(2, 1, 0.1, hx=lambda x: x[:1], fx=lambda x, dt: F @ x, points=points)
+    kf.R, kf.Q = np.array([[0.25]]), 0.01 * np.eye(2)
+    return kf
+
+
+FILTERS: dict[str, tuple[Callable[[], Any], tuple[Any, ...]]] = {
+    "linear": (linear, ()),
+    "extended": (extended, (lambda x: np.array([[1.0, 0.0]]), lambda x: x[:1])),
+    "unscented": (unscented, ()),
+}
+
+
+def drive(kf: Any, more: tuple[Any, ...]) -> list[tuple[Array, Array]]:
+    """A person's loop: a reading at every third prediction, another at every ninth, none where there is none."""
+    _, z = readings()
+    ended = []
+    for k in range(60):
+        kf.predict()
+        if k % 3 == 0:
+            kf.update(z[k].reshape(kf.y.shape) if k else z[k], *more)
+        if k % 9 == 0 and k:
+            ended.append((np.array(kf.x).ravel(), np.array(kf.P)))
+            kf.predict()  # whose sigma points an unscented filter's second update would lack
+            kf.update(z[k] + 0.1, *more, R=0.5)
+        if k == 10:
+            kf.update(None, *more)
+        ended.append((np.array(kf.x).ravel(), np.array(kf.P)))
+    return ended
+
+
+@pytest.mark.parametrize("kind", FILTERS)
+def test_filterpy_s_filters_are_watched_and_not_changed(kind: str, tmp_path: Path) -> None:
+    make, more = FILTERS[kind]
+    alone, watched = make(), make()
+    rec = viz_estim.watch(watched, path=tmp_path / "a.rrd", space=STATE, dt=0.1)
+    told, plain = drive(watched, more), drive(alone, more)
+    rec.close()
+    for (x, P), (y, Q) in zip(told, plain, strict=True):
+        assert (x.tobytes(), P.tobytes()) == (y.tobytes(), Q.tobytes())
+    assert "predict" not in vars(watched)
+    run = viz_estim.load(tmp_path / "a.rrd")
+    np.testing.assert_array_equal(run.mean[1:], [x for x, _ in told])
+    np.testing.assert_array_equal(run.cov[1:], [P for _, P in told])
+    np.testing.assert_allclose(run.time, 0.1 * np.arange(67), atol=1e-9)
+    stages = {name: len(table.step) for name, table in run.stages.items()}
+    assert stages == {"start": 1, "predict": 66, "update": 20 + 6}
+    values = run.stages["update"].values
+    assert set(values["innovation.noise"].ravel()) == {0.25, 0.5}
+    assert 0.2 < run.summary()["nis"]["z"]["mean"] < 3
+    # What moved the estimate is the gain times the residual.
+    before = np.stack([t.mean[i] for t, i in (run.before(run.stages["update"], row) for row in range(26))])  # type: ignore[misc]
+    moved = (values["gain"] @ values["innovation.residual"][..., None])[..., 0]
+    np.testing.assert_allclose(run.stages["update"].mean - before, moved, atol=1e-9)
+
+
+def test_readings_of_another_size_are_another_sensor_s(tmp_path: Path) -> None:
+    kf = linear()
+    rec = viz_estim.watch(kf, path=tmp_path / "a.rrd")
+    for k in range(12):
+        kf.predict()
+        kf.update(1.0)
+        if k % 4 == 0:
+            kf.update(np.array([[1.0], [2.0]]), R=np.eye(2), H=np.eye(2))
+    rec.close()
+    run = viz_estim.load(tmp_path / "a.rrd")
+    assert {name: len(table.step) for name, table in run.stages.items()} == {
+        "start": 1, "predict": 12, "update": 12, "update_2": 3
+    }  # fmt: skip
+    assert run.summary()["nis"]["z2"]["dof"] == 2
+
+
+def test_a_filter_that_raises_is_post_mortem(tmp_path: Path) -> None:
+    kf = linear()
+    rec = viz_estim.watch(kf, path=tmp_path / "a.rrd")
+    kf.predict()
+    kf.update(1.0)
+    kf.predict()
+    kf.R = kf.R[:, :0]
+    with pytest.raises(ValueError, match="square"):
+        kf.update(1.0)
+    rec.close()
+    error = viz_estim.load(tmp_path / "a.rrd").properties["result"]["error"]
+    assert (error["step"], error["stage"]) == (2, "after predict")
+
+
+def test_one_line_is_all_that_a_person_s_program_needs(tmp_path: Path) -> None:
+    program = """
+from filterpy.kalman import KalmanFilter
+import viz_estim
+kf = KalmanFilter(1, 1)
+kf.H[:] = 1
+viz_estim.watch(kf)
+for z in range(50):
+    kf.predict()
+    kf.update(z)
+"""
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    run = viz_estim.load(tmp_path / "recordings" / "KalmanFilter.rrd")
+    assert run.complete
+    assert len(run.step) == 51
+
+
+def test_what_cannot_be_watched_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected a filter with x, P"):
+        viz_estim.watch(object(), path=tmp_path / "a.rrd")
+
+
+def test_stone_soup_s_predictor_and_updater_are_watched(tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from stonesoup.models.measurement.linear import LinearGaussian  # type: ignore[import-untyped]
+        from stonesoup.models.transition.linear import (  # type: ignore[import-untyped]
+            CombinedLinearGaussianTransitionModel,
+            ConstantVelocity,
+        )
+        from stonesoup.predictor.kalman import KalmanPredictor  # type: ignore[import-untyped]
+        from stonesoup.types.detection import Detection  # type: ignore[import-untyped]
+        from stonesoup.types.hypothesis import SingleHypothesis  # type: ignore[import-untyped]
+        from stonesoup.types.state import GaussianState  # type: ignore[import-untyped]
+        from stonesoup.updater.kalman import KalmanUpdater  # type: ignore[import-untyped]
+    start = datetime.datetime(2024, 1, 1)
+    model = LinearGaussian(4, (0, 2), 0.5 * np.eye(2))
+
+    def track(watched: bool) -> list[Array]:
+        predictor = KalmanPredictor(CombinedLinearGaussianTransitionModel([ConstantVelocity(0.05)] * 2))
+        updater = KalmanUpdater(model)
+        if watched:
+            names = {"x": "m", "vx": "m/s", "y": "m", "vy": "m/s"}
+            rec = viz_estim.watch(predictor, updater, path=tmp_path / "a.rrd", space=names)
+        rng, ended = np.random.default_rng(0), []
+        state = GaussianState([[0], [1], [0], [1]], np.diag([1.5, 0.5, 1.5, 0.5]), timestamp=start)
+        for k in range(1, 40):
+            stamp = start + datetime.timedelta(seconds=0.5 * k)
+            state = predictor.predict(state, timestamp=stamp)
+            if k % 2:
+                z = Detection(k * 0.5 + rng.standard_normal((2, 1)), timestamp=stamp, measurement_model=model)
+                state = updater.update(SingleHypothesis(state, z))
+            ended.append(np.array(state.state_vector, float).ravel())
+        if watched:
+            rec.close()
+        return ended
+
+    told, plain = track(watched=True), track(watched=False)
+    np.testing.assert_array_equal(told, plain)
+    run = viz_estim.load(tmp_path / "a.rrd")
+    np.testing.assert_array_equal(run.mean, told)
+    np.testing.assert_allclose(run.time, 0.5 * np.arange(39), atol=1e-9)
+    assert {name: len(table.step) for name, table in run.stages.items()} == {"predict": 39, "update": 20}
+    assert run.summary()["nis"]["z"]["dof"] == 2
+    values = run.stages["update"].values
+    before = np.stack([t.mean[i] for t, i in (run.before(run.stages["update"], row) for row in range(20))])  # type: ignore[misc]
+    moved = (values["gain"] @ values["innovation.residual"][..., None])[..., 0]
+    np.testing.assert_allclose(run.stages["update"].mean - before, moved, atol=1e-9)
