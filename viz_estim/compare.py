@@ -25,7 +25,7 @@ Table = list[tuple[str, list[str]]]
 def compare(paths: list[Path], out: Path | None, tol: float) -> tuple[dict[str, Any], str]:
     """Compares recordings with the first; writes the merged one. What `--json` prints, and the same for a person."""
     if not 2 <= len(paths) <= len(COLOURS):
-        raise BadInput(f"compare takes two to {len(COLOURS)} recordings, got {len(paths)}; leave some out")
+        raise BadInput(f"compare takes two to {len(COLOURS)} recordings, got {len(paths)}; name as many")
     if not (math.isfinite(tol) and tol >= 0):
         raise BadInput(f"--tol {tol:g}: expected a number from 0 on")
     names = _names(paths)

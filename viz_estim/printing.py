@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from viz_estim.core.measurement import split
 from viz_estim.parameters import kind_text, parameters
 
 if TYPE_CHECKING:
@@ -166,9 +167,8 @@ def _moved(run: Run, table: StageTable, at: int) -> dict[str, Any]:
     before = run.before(table, at)
     if before is None or "gain" not in table.values or "innovation" not in table.spaces:
         return {}
-    sigma = np.sqrt(np.maximum(np.diagonal(before[0].cov[before[1]]), np.finfo(float).tiny))
-    moved = table.values["gain"][at] * table.values["innovation.residual"][at]
-    in_sigma = moved / sigma[:, None]
+    std = np.sqrt(np.maximum(np.diagonal(before[0].cov[before[1]]), 0))
+    moved, in_sigma = split(table.values["gain"][at], table.values["innovation.residual"][at], std)
     order = np.argsort(-np.abs(in_sigma).max(0))
     names = table.spaces["innovation"].axes
     return {"moved": {names[j]: {"by": moved[:, j], "sigmas": in_sigma[:, j]} for j in order.tolist()}}

@@ -85,6 +85,12 @@ def gain(C: Array, S: Array, used: np.ndarray) -> Array:
     return transposed(solved)
 
 
+def split(K: Array, residual: Array, std: Array) -> tuple[Array, Array]:
+    """Δ = K·ν by component of the reading: K[:, j]·ν_j (*, d, m), and the same in σ of the state before, std (*, d)."""
+    moved = K * residual[..., None, :]
+    return moved, moved / np.maximum(std, np.sqrt(np.finfo(float).tiny))[..., None]
+
+
 def transposed(a: Array) -> Array:
     """The matrices (*, n, m) of a (*, m, n)."""
     return np.swapaxes(a, -1, -2)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from viz_estim.core.consistency import band
+from viz_estim.core.measurement import split
 from viz_estim.core.quaternions import Array
 from viz_estim.debugger.expressions import Absent
 from viz_estim.debugger.quantities import Axis, Frame, Quantity
@@ -147,12 +148,11 @@ def why_text(frame: Frame) -> str:
 
 
 def _by_reading(gain: Array, residual: Quantity, std: Array, axis: Axis) -> Iterator[str]:
-    moved = gain * residual.value[0]
-    in_sigma = np.abs(moved) / np.maximum(std, np.finfo(float).tiny)[:, None]
+    moved, in_sigma = split(gain, residual.value[0], std)
     assert residual.axes[0]
     names, units = residual.axes[0]
     width = max(map(len, names))
-    for j in np.argsort(-in_sigma.max(0)).tolist():
+    for j in np.argsort(-np.abs(in_sigma).max(0)).tolist():
         ν = _number(float(residual.value[0][j]), units[j], "+")
         yield f"  {names[j]:{width}}  ν {ν}:  {_moves(moved[:, j], std, axis)}"
 

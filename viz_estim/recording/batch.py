@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from viz_estim.core.beliefs import Belief, Particles
+from viz_estim.core.beliefs import Particles
 from viz_estim.core.modes import moments
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Step
@@ -168,8 +168,3 @@ def _stacked(found: list[Any]) -> Any:
         return np.array(found, dtype=float)
     except ValueError:
         return found
-
-
-def belief_fields(belief: Belief) -> list[str]:
-    """The arrays that a belief is made of, such as mean and cov."""
-    return list(belief.shapes)

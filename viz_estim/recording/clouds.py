@@ -33,8 +33,8 @@ class Clouds:
         self._before: Particles | None = None  # the whole cloud at the end of the step before
         self._descent: dict[int, tuple[Array, Array]] = {}  # by step: parents and children (L, 3)
         self._path = f"{schema.WORLD}/particles"
-        colours = rr.Arrows3D.from_fields(radii=[-1.0]) if self._turned else rr.Points3D.from_fields(radii=[-1.5])
-        send_static(stream, self._path, colours)
+        style = rr.Arrows3D.from_fields(radii=[-1.0]) if self._turned else rr.Points3D.from_fields(radii=[-1.5])
+        send_static(stream, self._path, style)
         modes = rr.Ellipsoids3D.from_fields(colors=[schema.MODE], line_radii=[-1.5], fill_mode="MajorWireframe")
         send_static(stream, f"{schema.WORLD}/modes", modes)
 

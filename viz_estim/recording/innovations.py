@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from viz_estim.core.consistency import band, nis
+from viz_estim.core.measurement import split
 from viz_estim.core.spaces import Product
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
@@ -55,9 +56,8 @@ class Innovations:
             return
         at = rows.at if len(chosen) == len(rows.at) else rows.at.pick(chosen)
         space = getattr(rows.stages[0], field).space
-        variance = np.diagonal(rows.prior("cov"), axis1=1, axis2=2)
-        sigma = np.sqrt(np.maximum(variance, np.finfo(float).tiny))
-        moved = rows.array("gain")[chosen] * rows.array(f"{field}.residual")[chosen][:, None, :] / sigma[:, :, None]
+        std = np.sqrt(np.maximum(np.diagonal(rows.prior("cov"), axis1=1, axis2=2), 0))
+        _, moved = split(rows.array("gain")[chosen], rows.array(f"{field}.residual")[chosen], std)
         names = [(name, axis) for name, part in space.parts.items() for axis in part.axes]
         shades = {name: schema.shades(self._colour(name), len(part.axes)) for name, part in space.parts.items()}
         colours = [shade for name in space.parts for shade in shades[name]]

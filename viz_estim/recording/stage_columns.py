@@ -6,7 +6,7 @@ import numpy as np
 import rerun as rr
 
 from viz_estim.core.stages import Innovation, Matches
-from viz_estim.recording.batch import Batch, StageRows, belief_fields
+from viz_estim.recording.batch import Batch, StageRows
 from viz_estim.recording.columns import numbers, once
 from viz_estim.recording.layout import Layout
 
@@ -23,7 +23,7 @@ def stage_columns(layout: Layout, batch: Batch, rows: StageRows, every: int) -> 
         columns += _thinned(rows, "belief.states", _own(rows, "belief.states", states, kept), "states")
         columns += _thinned(rows, "belief.log_weights", kept, "log_weights")
     else:
-        columns = [_column(rows, f"belief.{name}", name) for name in belief_fields(rows.stages[0].belief)]
+        columns = [_column(rows, f"belief.{name}", name) for name in rows.stages[0].belief.shapes]
     for field, what in fields.items():
         if "points" in what:
             columns += _thinned(rows, f"{field}.points", _own(rows, field, what, kept))
