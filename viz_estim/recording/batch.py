@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from operator import attrgetter
+from operator import attrgetter, is_
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,9 @@ import numpy as np
 from viz_estim.core.beliefs import Particles
 from viz_estim.core.modes import moments
 from viz_estim.core.quaternions import Array
-from viz_estim.core.run import Step
+from viz_estim.core.run import Step, Tick
 from viz_estim.core.stages import Stage
-from viz_estim.recording.columns import Times
+from viz_estim.recording.columns import Times, stacked
 
 
 class StageRows:
@@ -33,7 +33,7 @@ class StageRows:
     def values(self, path: str) -> Array | list[Array]:
         """The same as one array (M, …), or as a list where shapes differ."""
         if path not in self._gathered:
-            self._gathered[path] = _stacked(self.objects(path))
+            self._gathered[path] = stacked(self.objects(path))
         gathered: Array | list[Array] = self._gathered[path]
         return gathered
 
@@ -46,7 +46,7 @@ class StageRows:
         key = f"prior.{path}"
         if key not in self._gathered:
             read = attrgetter(f"belief.{path}")
-            self._gathered[key] = _stacked([read(stage) for stage in self.before if stage is not None])
+            self._gathered[key] = stacked([read(stage) for stage in self.before if stage is not None])
         return np.asarray(self._gathered[key])
 
     @cached_property
@@ -56,22 +56,34 @@ class StageRows:
 
     def shared(self, field: str, stage: str, earlier: str) -> np.ndarray:
         """Which rows hold in a field the very object that the stage before, if it is that one, holds in `earlier`."""
-        theirs = [_read(before, earlier) if before and before.name == stage else None for before in self.before]
-        return np.array([mine is one for mine, one in zip(self.objects(field), theirs, strict=True)])
+        key = f"shared.{field}.{stage}.{earlier}"
+        if key not in self._gathered:
+            read = attrgetter(earlier)
+            theirs = [read(before) if before and before.name == stage else None for before in self.before]
+            self._gathered[key] = np.fromiter(map(is_, self.objects(field), theirs), bool, len(theirs))
+        found: np.ndarray = self._gathered[key]
+        return found
 
 
 class Batch:
-    """Steps, with `times` of their first stages, `names` of their stages, and `stages` as rows by name.
+    """Steps, with `times` of their first stages, and `stages` as rows by name.
 
     first: the place on the stage timeline of the first step; `end` is the next batch's. before: the stage that ended
-    the step before.
+    the step before. What steps have in common is found once: `kind` (N,) says by its place in `kinds` which stages a
+    step has; `tick_kind` (N,) by its place in `ticks`, examples, whose sensors and faults are its tick's.
     """
 
     def __init__(self, steps: list[Step], first: int, before: Stage | None = None) -> None:
         self.steps = steps
-        self.names = [tuple([stage.name for stage in step.stages]) for step in steps]
+        codes: dict[tuple[str, ...], int] = {}
+        self.kind = np.array([codes.setdefault(_names(step.stages), len(codes)) for step in steps])
+        self.kinds = list(codes)
+        examples: dict[tuple[Any, ...], int] = {}
+        kinds = [examples.setdefault(_sensors(step.tick), len(examples)) for step in steps]
+        self.tick_kind = np.array(kinds)
+        self.ticks = [steps[kinds.index(code)].tick for code in range(len(examples))]
         # A step without any stage (it failed at once) still takes a place on the stage timeline.
-        counts = np.maximum(list(map(len, self.names)), 1)
+        counts = np.array([max(1, len(names)) for names in self.kinds])[self.kind]
         places = first + np.concatenate([[0], np.cumsum(counts)])
         self.end = int(places[-1])
         self.times = Times(
@@ -82,13 +94,11 @@ class Batch:
             self._ended.append(before)
             before = step.stages[-1] if step.stages else before
         self.last = before
-        alike: dict[tuple[str, ...], list[int]] = {}
-        for row, names in enumerate(self.names):
-            alike.setdefault(names, []).append(row)
         found: dict[str, list[tuple[np.ndarray, int, bool]]] = {}
-        for names, members in alike.items():
+        for code, names in enumerate(self.kinds):
+            members = np.flatnonzero(self.kind == code)
             for i, name in enumerate(names):
-                found.setdefault(name, []).append((np.array(members), i, i == len(names) - 1))
+                found.setdefault(name, []).append((members, i, i == len(names) - 1))
         self.stages = [self._rows_of(name, groups) for name, groups in found.items()]
 
     def _rows_of(self, name: str, groups: list[tuple[np.ndarray, int, bool]]) -> StageRows:
@@ -108,6 +118,11 @@ class Batch:
     @cached_property
     def _order(self) -> np.ndarray:
         return np.argsort(np.concatenate([rows.at.stage for rows in self.stages]))
+
+    @cached_property
+    def in_order(self) -> np.ndarray:
+        """Which stage each of all is, in order: its place in `stages`."""
+        return np.repeat(np.arange(len(self.stages)), [len(rows.stages) for rows in self.stages])[self._order]
 
     @cached_property
     def at(self) -> Times:
@@ -155,16 +170,11 @@ class Batch:
 _TIMELINES = ("step", "time", "stage")
 
 
-def _read(stage: Stage | None, path: str) -> Any:
-    """A quantity of a stage by its path; None where it has none."""
-    value: Any = stage
-    for name in path.split("."):
-        value = getattr(value, name, None)
-    return value
+def _names(stages: tuple[Stage, ...]) -> tuple[str, ...]:
+    return tuple([stage.name for stage in stages])
 
 
-def _stacked(found: list[Any]) -> Any:
-    try:
-        return np.array(found, dtype=float)
-    except ValueError:
-        return found
+def _sensors(tick: Tick) -> tuple[Any, ...]:
+    """What ticks have in common: which sensors they have readings of, and what is wrong with these."""
+    faults = (*tick.faults.items(), *tick.stand_ins) if tick.faults else ()
+    return (*tick.measurements, None, *tick.raw, None, *faults)

@@ -14,7 +14,7 @@ from viz_estim.core.scenery import Box, Landmarks, Path
 from viz_estim.core.spaces import SE2
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch
-from viz_estim.recording.columns import Times, drawn, send_static
+from viz_estim.recording.columns import Column, Times, drawn, send, send_static
 from viz_estim.recording.layout import Layout, flat3, place_of
 
 _DEFAULT_BODY = (0.6, 0.4, 0.15)
@@ -183,8 +183,8 @@ class Bodies:
             self._styled.add(path)
             send_static(self._stream, path, archetype)
 
-    def _send(self, path: str, at: Times, columns: list[rr.ComponentColumn]) -> None:
-        rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)
+    def _send(self, path: str, at: Times, columns: list[Column]) -> None:
+        send(self._stream, path, at, columns)
 
 
 def axes_of(cov: Array) -> tuple[Array, Array]:

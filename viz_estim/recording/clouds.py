@@ -16,7 +16,7 @@ from viz_estim.core.stages import Resample, Stage
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
 from viz_estim.recording.bodies import axes_of, tips, xyzw
-from viz_estim.recording.columns import drawn, send_static
+from viz_estim.recording.columns import drawn, send, send_static
 from viz_estim.recording.layout import KEPT, Layout, flat3, place_of
 from viz_estim.recording.standing import Standing
 
@@ -67,7 +67,7 @@ class Clouds:
                 at = batch.times.pick(late)
                 kind, shape = (rr.Arrows3D, "vectors") if self._turned else (rr.Points3D, "positions")
                 nothing = drawn(kind, 0, len(at), **{shape: np.empty((0, 3))})
-                rr.send_columns(self._path, at.columns, nothing, recording=self._stream, strict=True)
+                send(self._stream, self._path, at, nothing)
         self._draw_modes(batch)
 
     def _draw(self, rows: StageRows) -> None:
@@ -86,7 +86,7 @@ class Clouds:
             values |= {"origins": places, "vectors": self._ahead(states)} if self._turned else {"positions": places}
         kind = rr.Arrows3D if self._turned else rr.Points3D
         columns = drawn(kind, count, len(at), **values)
-        rr.send_columns(self._path, at.columns, columns, recording=self._stream, strict=True)
+        send(self._stream, self._path, at, columns)
 
     def _draw_descent(self, rows: StageRows) -> None:
         steps = [step for step in rows.at.step.tolist() if step in self._descent]
@@ -123,7 +123,7 @@ class Clouds:
             half_sizes=3 * sizes, quaternions=xyzw(turns),
             centers=self._places(np.array([mode.mean for mode in every]).reshape(-1, len(layout.space.names))),
         )  # fmt: skip
-        rr.send_columns(f"{schema.WORLD}/modes", at.columns, columns, recording=self._stream, strict=True)
+        send(self._stream, f"{schema.WORLD}/modes", at, columns)
 
     def _places(self, states: Array) -> Array:
         layout = self._layout

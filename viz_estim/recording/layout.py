@@ -92,11 +92,9 @@ class Layout:
                     new = True
             new |= self._learn_sources(rows)
         seen = dict.fromkeys(self.inputs)
-        for step in batch.steps:
-            for named in (step.tick.measurements, step.tick.raw):
-                if named and not named.keys() <= seen.keys():
-                    seen |= dict.fromkeys(named)
-                    new = True
+        for tick in batch.ticks:
+            seen |= dict.fromkeys([*tick.measurements, *tick.raw])
+        new |= len(seen) > len(self.inputs)
         self.inputs = list(seen)
         return new
 
@@ -149,16 +147,16 @@ class Layout:
 
 def _silences(scenario: Scenario) -> dict[str, set[int]]:
     """By sensor, the steps before its first reading, and within a gap of more than five times its usual interval."""
-    came: dict[str, list[int]] = {}
+    together: dict[tuple[str, ...], list[int]] = {}
     for k, tick in enumerate(scenario.ticks):
-        for sensor in {**tick.measurements, **tick.raw}:
-            came.setdefault(sensor, []).append(k)
+        together.setdefault((*tick.measurements, *tick.raw), []).append(k)
     silent = {}
-    for sensor, steps in came.items():
-        usual = float(np.median(np.diff(steps))) if len(steps) > 1 else 1.0
-        ends = zip([-1, *steps], [*steps, len(scenario.ticks)], strict=True)
-        gaps = [range(a + 1, b) for a, b in ends if b - a > 5 * usual or a < 0]
-        silent[sensor] = {step for gap in gaps for step in gap}
+    for sensor in dict.fromkeys(name for names in together for name in names):
+        came = np.sort(np.concatenate([steps for names, steps in together.items() if sensor in names]))
+        usual = float(np.median(np.diff(came))) if len(came) > 1 else 1.0
+        ends = np.concatenate([[-1], came, [len(scenario.ticks)]])
+        gaps = np.flatnonzero((np.diff(ends) > 5 * usual) | (ends[:-1] < 0))
+        silent[sensor] = {step for gap in gaps for step in range(ends[gap] + 1, ends[gap + 1])}
     return silent
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import rerun as rr
 
 from viz_estim.core.quaternions import Array
 from viz_estim.recording import schema
-from viz_estim.recording.columns import Times, drawn, send_static
+from viz_estim.recording.columns import Times, drawn, send, send_static
 
 Series = tuple[str, schema.Colour, Array]  # name, colour, values (N,)
 
@@ -28,7 +30,7 @@ class Lines:
             components["variances"] = np.zeros_like(components["values"])
             components["variances"][:, -1] = variance
         columns = drawn(rr.Measurements, len(series), len(at), **components)
-        rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)
+        send(self._stream, path, at, columns)
 
     def within(self, path: str, at: Times, unit: str, line: Series, variance: Array, *, gapless: bool) -> None:
         """A value between the lines at ±3σ that it should stay within. gapless: it is known in every row of the run,
@@ -55,16 +57,21 @@ class Lines:
             counts = np.isfinite(drawn_values)
             self._style(path, unit, [(name, colour, drawn_values)])
             columns = drawn(rr.Measurements, counts.astype(int), len(at), values=drawn_values[counts])
-            rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)
+            send(self._stream, path, at, columns)
 
     def _style(self, path: str, unit: str, series: list[Series]) -> None:
         if path not in self._styled:
             self._styled.add(path)
             names, colours, _ = zip(*series, strict=True)
-            style = rr.Measurements.from_fields(
-                names=names, colors=colours, units=[unit] * len(names), aggregation_policy="MinMax"
-            )
-            send_static(self._stream, path, style)
+            send_static(self._stream, path, _style(names, colours, unit))
+
+
+@cache
+def _style(names: tuple[str, ...], colours: tuple[schema.Colour, ...], unit: str) -> rr.Measurements:
+    """Made once for all plots that look alike: it takes longer than a hundred rows."""
+    return rr.Measurements.from_fields(
+        names=names, colors=colours, units=[unit] * len(names), aggregation_policy="MinMax"
+    )
 
 
 def shown(unit: str) -> tuple[str, float]:

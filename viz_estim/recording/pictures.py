@@ -14,7 +14,7 @@ from viz_estim.core.scenery import Camera
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
 from viz_estim.recording.bodies import xyzw
-from viz_estim.recording.columns import Times, send_static
+from viz_estim.recording.columns import Times, send, send_static
 from viz_estim.recording.layout import Layout
 
 CAMERA = f"{schema.ATTITUDE}/camera"
@@ -109,7 +109,7 @@ class Pictures:
         self._send(path, at, rr.EncodedImage.columns(blob=[_jpeg(image) for image in images]))
 
     def _send(self, path: str, at: Times, columns: rr.ComponentColumnList) -> None:
-        rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)
+        send(self._stream, path, at, columns)
 
 
 def views(layout: Layout) -> list[rrb.View]:

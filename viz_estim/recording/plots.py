@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from itertools import chain
-
 import numpy as np
 import rerun as rr
 
 from viz_estim.core.descriptions import describe
 from viz_estim.core.quaternions import Array
-from viz_estim.core.run import Step
+from viz_estim.core.run import Step, Tick
 from viz_estim.core.spaces import SO3, Euclidean, Space
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch
-from viz_estim.recording.columns import Times, drawn, send_static
+from viz_estim.recording.columns import Times, drawn, send, send_static, words
 from viz_estim.recording.innovations import Innovations
 from viz_estim.recording.layout import Layout
 from viz_estim.recording.lines import Lines, Series, shown
@@ -35,15 +33,11 @@ class Plots:
                 self._draw_probabilities(batch)
             else:
                 self._draw_states(batch)
-            self._lane("stage", batch.at, list(chain.from_iterable(batch.names)))
+            self._lane("stage", batch.at, [rows.name for rows in batch.stages], batch.in_order)
         self._draw_figures(batch)
         gated = self._innovations.add(batch)
         for sensor in self._layout.inputs:
-            refused = gated.get(sensor, set())
-            states = [self._health(step, sensor, refused) for step in batch.steps]
-            due = [i for i, state in enumerate(states) if state]
-            if due:
-                self._lane(sensor, batch.times.pick(np.array(due)), [states[i] for i in due])
+            self._draw_health(batch, sensor, gated.get(sensor, set()))
 
     def _draw_states(self, batch: Batch) -> None:
         """The belief at the end of each step, by part: its components, its σ, its error."""
@@ -129,18 +123,20 @@ class Plots:
             marks = rr.Points3D([line[1] for line in axis], colors=[schema.BAND], radii=[-1], labels=["0", "½", "1"])
             send_static(self._stream, f"{schema.BARS}/marks", marks)
         columns = drawn(rr.Boxes3D, len(labels), len(at), half_sizes=sizes, centers=centers)
-        rr.send_columns(f"{schema.BARS}/probability", at.columns, columns, recording=self._stream, strict=True)
+        send(self._stream, f"{schema.BARS}/probability", at, columns)
         if any(step.truth is not None for step in batch.steps):
             known = np.isfinite(batch.truth[:, 0])
-            names = [labels[int(i)] if k else "" for i, k in zip(batch.truth[:, 0], known, strict=True)]
-            self._lane("truth", batch.times, names)
+            which = np.where(known, batch.truth[:, 0], len(labels)).astype(int)
+            self._lane("truth", batch.times, [*labels, ""], which)
 
-    def _lane(self, name: str, at: Times, states: list[str]) -> None:
-        """A lane of states, written where they change."""
-        changed = [i for i, (a, b) in enumerate(zip([self._states.get(name), *states], states, strict=False)) if a != b]
-        if not changed:
+    def _lane(self, name: str, at: Times, states: list[str], which: np.ndarray) -> None:
+        """A lane of states, written where they change; which (M,) says by its place what each row's is."""
+        last = self._states.get(name)
+        first = states.index(last) if last in states else -1
+        changed = np.flatnonzero(np.diff(which, prepend=first))
+        if not len(changed):
             return
-        self._states[name] = states[-1]
+        self._states[name] = states[which[-1]]
         path = schema.lane(name)
         meanings = schema.HEALTH
         if name == "stage":
@@ -152,20 +148,27 @@ class Plots:
             self._styled.add(key)
             style = rr.StateConfiguration(values=list(meanings), colors=list(meanings.values()))
             send_static(self._stream, path, style)
-        columns = rr.StateChange.columns(state=[states[i] for i in changed])
-        rr.send_columns(path, at.pick(np.array(changed)).columns, columns, recording=self._stream, strict=True)
+        send(self._stream, path, at.pick(changed), [words(rr.StateChange, "state", states, which[changed])])
 
     def _colour(self, sensor: str) -> schema.Colour:
         return schema.sensor_colour(self._layout.place(sensor))[1]
 
-    def _health(self, step: Step, sensor: str, gated: set[int]) -> str:
-        """What became of a sensor's reading in this step: a key of `schema.HEALTH`, or the fault's own name; nothing
-        where no reading was due."""
-        tick = step.tick
-        if tick.faults and sensor in tick.faults:
-            return f"{tick.faults[sensor]}, {'rejected' if sensor in tick.stand_ins else 'used'}"
-        if step.index in gated:
-            return "gated"
-        if sensor in tick.measurements or sensor in tick.raw:
-            return "used"
-        return "absent" if step.index in self._layout.silent.get(sensor, ()) else ""
+    def _draw_health(self, batch: Batch, sensor: str, gated: set[int]) -> None:
+        """What became of a sensor's reading in each step, as a lane; nothing where none was due."""
+        states = [*(_health(tick, sensor) for tick in batch.ticks), "gated", "absent"]
+        which, step = batch.tick_kind.copy(), batch.times.step
+        faulty = np.array([sensor in tick.faults for tick in batch.ticks])[which]
+        there = np.array([bool(state) for state in states])
+        which[np.isin(step, list(gated)) & ~faulty] = len(states) - 2
+        which[np.isin(step, list(self._layout.silent.get(sensor, ()))) & ~there[which]] = len(states) - 1
+        due = np.flatnonzero(there[which])
+        if len(due):
+            texts = list(dict.fromkeys(states))  # ticks of several kinds may have it in one state
+            self._lane(sensor, batch.times.pick(due), texts, np.array([texts.index(s) for s in states])[which[due]])
+
+
+def _health(tick: Tick, sensor: str) -> str:
+    """What became of a reading that no gate refused: a key of `schema.HEALTH`, or the fault's own name."""
+    if sensor in tick.faults:
+        return f"{tick.faults[sensor]}, {'rejected' if sensor in tick.stand_ins else 'used'}"
+    return "used" if sensor in tick.measurements or sensor in tick.raw else ""

@@ -8,7 +8,7 @@ import os
 import re
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from viz_estim.recording import blueprints, schema
 from viz_estim.recording.batch import Batch
 from viz_estim.recording.bodies import Bodies
 from viz_estim.recording.clouds import Clouds
-from viz_estim.recording.columns import Times, numbers, send_static
+from viz_estim.recording.columns import Times, numbers, send, send_static
 from viz_estim.recording.layout import Layout
 from viz_estim.recording.pictures import Pictures
 from viz_estim.recording.plots import Plots
@@ -180,7 +180,7 @@ class Recorder:
             self._send_properties()
         self._send_steps(batch)
         for rows in batch.stages:
-            self._send(schema.stage(rows.name), rows.at, stage_columns(self._layout, batch, rows, self._every))
+            send(self._stream, schema.stage(rows.name), rows.at, stage_columns(self._layout, batch, rows, self._every))
         self._bodies.add(batch)
         self._scenes.add(batch)
         self._registration.add(batch)
@@ -196,10 +196,7 @@ class Recorder:
             text = f"step {error.step}, stage {error.stage}: {error.message}"
             last = batch.times.pick(np.array([-1]))
             at = Times(last.step, last.time, np.array([batch.end - 1]))
-            self._send(schema.EVENTS, at, rr.TextLog.columns(text=[text], level=["ERROR"]))
-
-    def _send(self, path: str, at: Times, columns: Iterable[rr.ComponentColumn]) -> None:
-        rr.send_columns(path, at.columns, columns, recording=self._stream, strict=True)
+            send(self._stream, schema.EVENTS, at, rr.TextLog.columns(text=[text], level=["ERROR"]))
 
     def _send_steps(self, batch: Batch) -> None:
         steps = batch.steps
@@ -211,8 +208,9 @@ class Recorder:
             truths = {"label": slice(0, 1)}
         for part, where in truths.items():
             values = batch.truth[:, where]
-            missing = set(np.flatnonzero(~np.isfinite(values).all(axis=1)).tolist())
-            optional[f"truth.{part}"] = [None if row in missing else x for row, x in enumerate(values)]
+            known = np.asarray(np.isfinite(values).all(axis=1))
+            if known.any():
+                columns.append(numbers("viz_estim.Step", f"truth.{part}", values, known))
         for sensor in self._layout.inputs:
             optional[f"z.{sensor}"] = [s.tick.measurements.get(sensor) for s in steps]
             optional[f"raw.{sensor}"] = [s.tick.raw.get(sensor) for s in steps]
@@ -221,7 +219,7 @@ class Recorder:
             for name, rows in optional.items()
             if any(row is not None for row in rows)
         ]
-        self._send(schema.STEPS, batch.times, columns)
+        send(self._stream, schema.STEPS, batch.times, columns)
 
 
 def partial_of(path: Path) -> Path:

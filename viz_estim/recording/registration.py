@@ -10,7 +10,7 @@ from viz_estim.core.scenery import Cloud
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
 from viz_estim.recording.bodies import xyzw
-from viz_estim.recording.columns import drawn, send_static
+from viz_estim.recording.columns import drawn, send, send_static
 from viz_estim.recording.layout import Layout, flat3, place_of
 from viz_estim.recording.standing import Standing
 
@@ -51,7 +51,7 @@ class Registration:
             half = 0.5 * mean[:, layout.space.at[layout.heading]][:, -1]
             q = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
         columns = drawn(rr.Transform3D, 1, len(batch.at), translation=place, quaternion=xyzw(q))
-        rr.send_columns(f"{schema.WORLD}/moved", batch.at.columns, columns, recording=self._stream, strict=True)
+        send(self._stream, f"{schema.WORLD}/moved", batch.at, columns)
 
     def _draw_matches(self, rows: StageRows, field: str) -> None:
         kept = np.flatnonzero(rows.at.step % self._every == 0)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import numpy as np
-import rerun as rr
+from typing import Any
 
+import numpy as np
+
+from viz_estim.core.quaternions import Array
 from viz_estim.core.stages import Innovation, Matches
 from viz_estim.recording.batch import Batch, StageRows
-from viz_estim.recording.columns import numbers, once
+from viz_estim.recording.columns import Column, numbers, once
 from viz_estim.recording.layout import Layout
 
 _STAGE = "viz_estim.Stage"
 
 
-def stage_columns(layout: Layout, batch: Batch, rows: StageRows, every: int) -> list[rr.ComponentColumn]:
+def stage_columns(layout: Layout, batch: Batch, rows: StageRows, every: int) -> list[Column]:
     """All columns of one stage's rows; geometry (points, clouds, matches) at every N-th step alone."""
     kept = rows.at.step % every == 0
     fields = layout.stages[rows.name]
@@ -44,29 +46,27 @@ def _own(rows: StageRows, field: str, what: dict[str, list[str]] | None, kept: n
     return kept & ~rows.shared(field, *what["same_as"]) if what and "same_as" in what else kept
 
 
-def _moments(rows: StageRows, batch: Batch) -> list[rr.ComponentColumn]:
+def _moments(rows: StageRows, batch: Batch) -> list[Column]:
     """Mean and covariance of clouds, at the end of each step alone: of the others the reader works them out."""
     if not rows.last.any():
         return []
     at = np.searchsorted(batch.end_rows, rows.rows)
     values = zip(("mean", "cov"), batch.end_moments, strict=True)
-    if rows.last.all():
-        return [numbers(_STAGE, name, found[at]) for name, found in values]
-    return [
-        numbers(_STAGE, name, [found[i] if last else None for i, last in zip(at, rows.last, strict=True)])
-        for name, found in values
-    ]
+    at = np.minimum(at, len(batch.end_rows) - 1)  # of those that end no step, whichever
+    return [numbers(_STAGE, name, found[at], rows.last) for name, found in values]
 
 
-def _thinned(rows: StageRows, path: str, kept: np.ndarray, name: str | None = None) -> list[rr.ComponentColumn]:
+def _thinned(rows: StageRows, path: str, kept: np.ndarray, name: str | None = None) -> list[Column]:
     """Geometry, in the rows where it is kept."""
-    if kept.all():
-        return [numbers(_STAGE, name or path, rows.values(path))]
-    values = zip(rows.objects(path), kept, strict=True)
-    return [numbers(_STAGE, name or path, [v if k else None for v, k in values])] if kept.any() else []
+    if not kept.any():
+        return []
+    values: Array | list[Any] = rows.values(path)
+    if isinstance(values, list):
+        values = [value if keep else None for value, keep in zip(values, kept, strict=True)]
+    return [numbers(_STAGE, name or path, values, kept)]
 
 
-def _column(rows: StageRows, path: str, name: str | None = None) -> rr.ComponentColumn:
+def _column(rows: StageRows, path: str, name: str | None = None) -> Column:
     """A quantity of the stage; once, where all rows hold the same object (a constant noise, say)."""
     found = rows.objects(path)
     if len(found) > 1 and found[0] is found[-1] and all(value is found[0] for value in found):

@@ -11,7 +11,7 @@ import rerun as rr
 
 from viz_estim.core.quaternions import Array
 from viz_estim.recording.batch import Batch
-from viz_estim.recording.columns import Times, drawn, send_static
+from viz_estim.recording.columns import Column, Times, drawn, place, send, send_static
 
 _SHAPE: dict[Any, str] = {rr.Points3D: "positions", rr.Arrows3D: "vectors", rr.Ellipsoids3D: "half_sizes"}
 
@@ -45,7 +45,7 @@ class Standing:
         if path not in self._paths:
             send_static(self._stream, path, style)
         self.add(stage, field, path, kind, _SHAPE[kind])
-        rr.send_columns(path, at.columns, drawn(kind, count, len(at), **values), recording=self._stream, strict=True)
+        send(self._stream, path, at, drawn(kind, count, len(at), **values))
 
     def add(self, stage: str, field: str, path: str, kind: Any, shape: str) -> None:
         """Takes in a path that another draws."""
@@ -62,36 +62,37 @@ class Standing:
         """Takes away what a field of a stage drew, on all timelines."""
         for path, one in self._paths.items():
             if (one.stage, one.field) == (stage, field):
-                rr.send_columns(path, at.columns, self._nothing(one, len(at)), recording=self._stream, strict=True)
+                send(self._stream, path, at, self._nothing(one, len(at)))
 
     def clear(self, batch: Batch) -> None:
         """Takes away what the batch's stages left."""
         if not self._paths:
             return
-        # Steps with the same stages, after a step with the same, are treated alike.
-        alike: dict[tuple[tuple[str, ...], tuple[str, ...], bool], list[int]] = {}
-        for row, (names, step) in enumerate(zip(batch.names, batch.times.step.tolist(), strict=True)):
-            kept = step % self._every == 0
-            alike.setdefault((self._last, names, kept), []).append(row)
-            self._last = names if kept else ()
+        # Steps with the same stages, after a step with the same, are treated alike. Of a step that is not kept, none
+        # has drawn.
+        drew: list[tuple[str, ...]] = [self._last, (), *batch.kinds]
+        now_of = np.where(batch.times.step % self._every == 0, batch.kind + 2, 1)
+        before_of = np.concatenate([[0], now_of[:-1]])
+        pairs = dict.fromkeys(zip(before_of.tolist(), now_of.tolist(), strict=True))
+        alike = [(drew[a], drew[b], np.flatnonzero((before_of == a) & (now_of == b))) for a, b in pairs]
+        self._last = drew[now_of[-1]]
         for path, one in self._paths.items():
             within, absent = [], []
-            for (before, names, kept), rows in alike.items():
-                now = names if kept else ()
+            for before, now, rows in alike:
                 if one.stage in before and one.stage not in now:
-                    absent.append(np.array(rows))
-                follows = [(before[-1], names[0], 0)] if before and one.stage in now else []
+                    absent.append(rows)
+                follows = [(before[-1], now[0], 0)] if before and one.stage in now else []
                 follows += [(name, after, i + 1) for i, (name, after) in enumerate(pairwise(now))]
                 for name, after, offset in follows:
                     if name in one.during and after not in one.during:
                         within.append(batch.times.stage[rows] + offset)
             if within:
                 places = np.sort(np.concatenate(within))
-                index = [rr.TimeColumn("stage", sequence=places)]
-                rr.send_columns(path, index, self._nothing(one, len(places)), recording=self._stream, strict=True)
+                nothing: list[Any] = self._nothing(one, len(places))
+                rr.send_columns(path, [place(places)], nothing, recording=self._stream, strict=True)
             if absent:
                 at = batch.times.pick(np.sort(np.concatenate(absent)))
-                rr.send_columns(path, at.columns, self._nothing(one, len(at)), recording=self._stream, strict=True)
+                send(self._stream, path, at, self._nothing(one, len(at)))
 
-    def _nothing(self, one: _Drawn, rows: int) -> list[rr.ComponentColumn]:
+    def _nothing(self, one: _Drawn, rows: int) -> list[Column]:
         return drawn(one.kind, 0, rows, **{one.shape: np.empty((0, 3))})
