@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
@@ -34,18 +32,20 @@ def moments(space: Space, states: Array, log_weights: Array) -> tuple[Array, Arr
     The fixed point m = m ⊞ Σ wᵢ (xᵢ ⊟ m), started at the heaviest particle (Pennec 1998). Angles spread all around have
     none; theirs is where the iteration stands when it is given up, and their covariance says how little that means.
     """
-    states = np.asfortranarray(states)  # each column in one piece: numpy is fast along long axes
-    weights = np.exp(log_weights)[..., None, :]
+    # Each component in one piece: numpy is fast along long axes.
+    states = np.moveaxis(np.ascontiguousarray(np.moveaxis(states, -1, 0)), 0, -1)
+    weights = np.exp(log_weights)[..., None]
     heaviest = log_weights.argmax(-1)[..., None, None]
     mean = np.take_along_axis(states, heaviest, axis=-2)
     settled = max(1e-10, 64 * np.finfo(float).eps * float(np.abs(states).max()))
     for _ in range(_ROUNDS):
         error = space.minus(states, mean)
-        step = weights @ error
+        across = np.swapaxes(error, -1, -2)
+        step = np.swapaxes(across @ weights, -1, -2)
         mean = space.plus(mean, step)
         if np.abs(step).max() < settled:
             break
-    cov = (np.swapaxes(error, -1, -2) * weights) @ error
+    cov = (across * np.swapaxes(weights, -1, -2)) @ error
     return mean[..., 0, :], 0.5 * (cov + np.swapaxes(cov, -1, -2))
 
 
@@ -94,16 +94,21 @@ def _basins(density: Array) -> np.ndarray:
     while (peak != peak[peak]).any():
         peak = peak[peak]
     height = density.ravel()[peak].reshape(density.shape)
-    basin = peak.reshape(density.shape)
+    peaks, label = np.unique(peak, return_inverse=True)
+    basin = label.reshape(density.shape)
     joined = []
     for axis in range(density.ndim):
         (low, high), (a, b), (one, other) = (_neighbours(x, axis) for x in (density, height, basin))
-        no_valley = np.minimum(low, high) > _VALLEY * np.minimum(a, b)
+        no_valley = (one != other) & (np.minimum(low, high) > _VALLEY * np.minimum(a, b))
         joined.append(np.stack([one[no_valley], other[no_valley]]))
-    edges = np.concatenate(joined, axis=1)
-    graph = coo_array((np.ones(edges.shape[1]), edges), shape=(order.size,) * 2)
-    label: np.ndarray = connected_components(graph, directed=False)[1]
-    return label[peak]
+    one, other = np.concatenate(joined, axis=1)
+    together = np.arange(len(peaks))  # of those that are joined, the lowest number; they are few
+    while (lowest := np.minimum(together[one], together[other])).size:
+        np.minimum.at(together, one, lowest)
+        np.minimum.at(together, other, lowest)
+        if (together[one] == together[other]).all():
+            break
+    return together[label]
 
 
 def _neighbours(x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:

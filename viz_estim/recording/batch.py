@@ -17,13 +17,15 @@ from viz_estim.recording.columns import Times, stacked
 
 
 class StageRows:
-    """All rows of one stage in a batch: its records, their times, their steps' rows, which ended their step, and the
-    stage before each (None at the run's first)."""
+    """All rows of one stage in a batch: its records, their times, their steps' rows, which began and which ended their
+    step, and the stage before each (None at the run's first)."""
 
     def __init__(
-        self, name: str, stages: list[Stage], at: Times, rows: np.ndarray, last: np.ndarray, before: list[Stage | None]
-    ) -> None:
-        self.name, self.stages, self.at, self.rows, self.last, self.before = name, stages, at, rows, last, before
+        self, name: str, stages: list[Stage], at: Times, rows: np.ndarray, first: np.ndarray, last: np.ndarray,
+        before: list[Stage | None],
+    ) -> None:  # fmt: skip
+        self.name, self.stages, self.at, self.rows = name, stages, at, rows
+        self.first, self.last, self.before = first, last, before
         self._gathered: dict[str, Any] = {}
 
     def objects(self, path: str) -> list[Any]:
@@ -55,12 +57,24 @@ class StageRows:
         return np.array([stage is not None for stage in self.before])
 
     def shared(self, field: str, stage: str, earlier: str) -> np.ndarray:
-        """Which rows hold in a field the very object that the stage before, if it is that one, holds in `earlier`."""
+        """Which rows hold in a field the very object that the stage before in the same step, if it is that one, holds
+        in `earlier`."""
         key = f"shared.{field}.{stage}.{earlier}"
         if key not in self._gathered:
             read = attrgetter(earlier)
             theirs = [read(before) if before and before.name == stage else None for before in self.before]
-            self._gathered[key] = np.fromiter(map(is_, self.objects(field), theirs), bool, len(theirs))
+            same = np.fromiter(map(is_, self.objects(field), theirs), bool, len(theirs))
+            self._gathered[key] = same & ~self.first
+        found: np.ndarray = self._gathered[key]
+        return found
+
+    def copied(self, stage: str) -> np.ndarray:
+        """Which rows hold the particles that their `ancestors` name of the stage before, to the bit, if it is that one
+        in the same step."""
+        key = f"copied.{stage}"
+        if key not in self._gathered:
+            copies = zip(self.stages, self.before, self.first.tolist(), strict=True)
+            self._gathered[key] = np.array([not first and _copied(one, before, stage) for one, before, first in copies])
         found: np.ndarray = self._gathered[key]
         return found
 
@@ -101,6 +115,10 @@ class Batch:
                 found.setdefault(name, []).append((members, i, i == len(names) - 1))
         self.stages = [self._rows_of(name, groups) for name, groups in found.items()]
 
+    def ended(self, row: int) -> Stage | None:
+        """The stage that ended the step before a step of the batch."""
+        return self._ended[row]
+
     def _rows_of(self, name: str, groups: list[tuple[np.ndarray, int, bool]]) -> StageRows:
         rows = np.concatenate([members for members, _, _ in groups])
         offsets = np.concatenate([np.full(len(members), i) for members, i, _ in groups])
@@ -113,7 +131,8 @@ class Batch:
         pairs = list(zip(rows.tolist(), offsets.tolist(), strict=True))
         stages = [steps[row].stages[i] for row, i in pairs]
         before = [steps[row].stages[i - 1] if i else ended[row] for row, i in pairs]
-        return StageRows(name, stages, Times(self.times.step[rows], self.times.time[rows], places), rows, last, before)
+        at = Times(self.times.step[rows], self.times.time[rows], places)
+        return StageRows(name, stages, at, rows, offsets == 0, last, before)
 
     @cached_property
     def _order(self) -> np.ndarray:
@@ -150,7 +169,7 @@ class Batch:
         """Mean (N, n) and covariance (N, d, d) at the end of each step; of clouds, many at once."""
         ended = [self.steps[row].stages[-1].belief for row in self.end_rows.tolist()]
         if ended and isinstance(ended[0], Particles):
-            space, size = ended[0].space, max(1, 50_000 // len(ended[0].log_weights))
+            space, size = ended[0].space, max(1, 10_000 // len(ended[0].log_weights))
             groups = [ended[i : i + size] for i in range(0, len(ended), size)]
             found = [
                 moments(space, np.stack([b.states for b in group]), np.stack([b.log_weights for b in group]))
@@ -168,6 +187,16 @@ class Batch:
 
 
 _TIMELINES = ("step", "time", "stage")
+
+
+def _copied(stage: Any, before: Any, name: str) -> bool:
+    """Whether the particles of a stage are copies of those before it: a thinned cloud's are not, nor are those that
+    were moved too."""
+    if before is None or before.name != name:
+        return False
+    states, ancestors = before.belief.states, stage.ancestors
+    within = len(ancestors) and ancestors.min() >= 0 and ancestors.max() < len(states)
+    return bool(within) and np.array_equal(stage.belief.states, states.take(ancestors, axis=0))
 
 
 def _names(stages: tuple[Stage, ...]) -> tuple[str, ...]:

@@ -17,11 +17,11 @@ from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
 from viz_estim.recording.bodies import axes_of, tips, xyzw
 from viz_estim.recording.columns import drawn, send, send_static
-from viz_estim.recording.layout import KEPT, Layout, flat3, place_of
+from viz_estim.recording.layout import KEPT, Layout, place_of
 from viz_estim.recording.standing import Standing
 
 _LINES = 400  # of ancestry, at most
-_LOOKS = 100  # how often in a run its modes are looked for: that takes longer than a step of a small filter
+_LOOKS = 50  # how often in a run its modes are looked for: that takes longer than a step of a small filter
 
 
 class Clouds:
@@ -33,8 +33,6 @@ class Clouds:
         self._before: Particles | None = None  # the whole cloud at the end of the step before
         self._descent: dict[int, tuple[Array, Array]] = {}  # by step: parents and children (L, 3)
         self._path = f"{schema.WORLD}/particles"
-        style = rr.Arrows3D.from_fields(radii=[-1.0]) if self._turned else rr.Points3D.from_fields(radii=[-1.5])
-        send_static(stream, self._path, style)
         modes = rr.Ellipsoids3D.from_fields(colors=[schema.MODE], line_radii=[-1.5], fill_mode="MajorWireframe")
         send_static(stream, f"{schema.WORLD}/modes", modes)
 
@@ -43,24 +41,20 @@ class Clouds:
         return bool(self._layout.heading or self._layout.attitude)
 
     def take(self, step: Step) -> Step:
-        """The step as it is kept: with thinned clouds; notes who descends from whom."""
-        for stage in step.stages:
-            if isinstance(stage, Resample) and self._before is not None and step.index % self._every == 0:
-                first = np.flatnonzero(np.diff(stage.ancestors, prepend=-1))  # copies stand together
-                chosen = first[:: max(1, -(-len(first) // _LINES))]
-                parents = self._before.states[stage.ancestors[chosen]]
-                self._descent[step.index] = self._places(parents), self._places(stage.belief.states[chosen])
-        if step.stages and isinstance(step.stages[-1].belief, Particles):
-            self._before = step.stages[-1].belief
+        """The step as it is kept: with thinned clouds; notes who descends from whom while the whole ones are there."""
         if not any(len(stage.belief.log_weights) > KEPT for stage in step.stages):
             return step
-        return dataclasses.replace(step, stages=tuple(_thinned(stage) for stage in step.stages))
+        for stage in step.stages:
+            if isinstance(stage, Resample) and self._before is not None and step.index % self._every == 0:
+                self._descent[step.index] = _descent_of(stage, self._before.states)
+        self._before = step.stages[-1].belief
+        return dataclasses.replace(step, stages=_thinned(step.stages))
 
     def add(self, batch: Batch) -> None:
         for rows in batch.stages:
             self._draw(rows)
             if "ancestors" in self._layout.stages[rows.name]:
-                self._draw_descent(rows)
+                self._draw_descent(batch, rows)
         if self._every > 1:
             late = np.flatnonzero(batch.times.step % self._every == 1)
             if len(late):
@@ -71,35 +65,57 @@ class Clouds:
         self._draw_modes(batch)
 
     def _draw(self, rows: StageRows) -> None:
+        """The cloud after a stage. Where it is the one before, only weighed anew, its colours change; where it is made
+        of copies of that, those that left none vanish: nothing moves, and a cloud is most of a recording's bytes."""
         kept = np.flatnonzero(rows.at.step % self._every == 0)
         if not len(kept):
             return
-        at = rows.at.pick(kept)
-        weights = np.exp(rows.array("belief.log_weights")[kept])
-        colours = schema.by_weight(weights / weights.max(axis=1, keepdims=True))
-        count, values = weights.shape[1], {"colors": colours}
-        what = self._layout.stages[rows.name].get("belief.states", {})
-        shared = rows.shared("belief.states", *what["same_as"])[kept].all() if "same_as" in what else False
-        if not shared:
-            states = rows.array("belief.states")[kept]
-            places = self._places(states)
-            values |= {"origins": places, "vectors": self._ahead(states)} if self._turned else {"positions": places}
+        at, every = rows.at.pick(kept), len(kept) == len(rows.at)
         kind = rr.Arrows3D if self._turned else rr.Points3D
-        columns = drawn(kind, count, len(at), **values)
+        log_weights = rows.array("belief.log_weights") if every else rows.array("belief.log_weights")[kept]
+        N = log_weights.shape[1]
+        what = self._layout.stages[rows.name].get("belief.states", {})
+        same, own = what.get("same_as"), _own(rows, what)[kept]
+        columns = []
+        if own.any():
+            states = rows.array("belief.states") if every else rows.array("belief.states")[kept]
+            places = self._places(states)
+            shown = {"origins": places, "vectors": self._ahead(states)} if self._turned else {"positions": places}
+            columns += drawn(kind, N, len(at), **shown)
+        if own.any() or (same and "by" in what):
+            radius = np.full((len(at), 1), -1.0 if self._turned else -1.5, np.float32)
+            if not own.any():
+                named = np.zeros((len(at), N), bool)
+                for row, i in enumerate(kept.tolist()):
+                    named[row, getattr(rows.stages[i], what["by"])] = True
+                radius = np.where(named, radius, np.float32(0))
+            columns += drawn(kind, radius.shape[1], len(at), radii=radius)
+        heaviest = log_weights.max(axis=1, keepdims=True)
+        if (log_weights == heaviest).all():
+            columns += drawn(kind, 1, len(at), colors=np.full(len(at), schema.by_weight(np.ones(1))))
+        else:
+            columns += drawn(kind, N, len(at), colors=schema.by_weight(np.exp((log_weights - heaviest).astype("f4"))))
         send(self._stream, self._path, at, columns)
 
-    def _draw_descent(self, rows: StageRows) -> None:
-        steps = [step for step in rows.at.step.tolist() if step in self._descent]
-        if steps:
-            lines = [self._descent.pop(step) for step in steps]
-            at = rows.at.pick(np.flatnonzero(np.isin(rows.at.step, steps)))
-            counts = np.array([len(parents) for parents, _ in lines])
-            origins, ends = (np.concatenate([pair[i] for pair in lines]) for i in (0, 1))
-            style = rr.Arrows3D.from_fields(colors=[schema.BAND], radii=[-0.5])
-            path = schema.drawn(rows.name, "ancestry")
-            self._standing.draw(
-                rows.name, "ancestors", path, at, style, counts, vectors=ends - origins, origins=origins
-            )
+    def _draw_descent(self, batch: Batch, rows: StageRows) -> None:
+        """Lines from parents, a step before, to their first children."""
+        lines, drawn_rows = [], []
+        for i, step in enumerate(rows.at.step.tolist()):
+            before: Any = batch.ended(int(rows.rows[i]))
+            if step in self._descent:
+                lines.append(self._descent.pop(step))
+            elif before is None or step % self._every or self._layout.particles > KEPT:
+                continue
+            else:
+                lines.append(_descent_of(rows.stages[i], before.belief.states))
+            drawn_rows.append(i)
+        if not lines:
+            return
+        counts = np.array([len(children) for _, children in lines])
+        origins, ends = (self._places(np.concatenate(some)) for some in zip(*lines, strict=True))
+        style = rr.Arrows3D.from_fields(colors=[schema.BAND], radii=[-0.5])
+        path, at = schema.drawn(rows.name, "ancestry"), rows.at.pick(np.array(drawn_rows))
+        self._standing.draw(rows.name, "ancestors", path, at, style, counts, vectors=ends - origins, origins=origins)
 
     def _draw_modes(self, batch: Batch) -> None:
         """Where the cloud stands in several places: each with its 3σ; nothing where it is one."""
@@ -129,7 +145,10 @@ class Clouds:
         layout = self._layout
         assert layout.position
         part = layout.space.parts[layout.position]
-        return flat3(place_of(part, states[..., layout.space.at[layout.position]]))
+        place = place_of(part, states[..., layout.space.at[layout.position]])
+        places = np.zeros((*place.shape[:-1], 3), np.float32)
+        places[..., : place.shape[-1]] = place
+        return places
 
     def _ahead(self, states: Array) -> Array:
         """A short arrow the way each particle looks."""
@@ -138,25 +157,65 @@ class Clouds:
         reach = 0.03 * layout.extent[1]
         if layout.heading and isinstance(layout.space.parts[layout.heading], (SO2, SE2)):
             turn = states[..., layout.space.at[layout.heading]][..., -1].astype(np.float32)
-            return reach * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
+            ahead = np.zeros((*turn.shape, 3), np.float32)
+            ahead[..., 0], ahead[..., 1] = reach * np.cos(turn), reach * np.sin(turn)
+            return ahead
         assert layout.attitude
         assert isinstance(layout.space.parts[layout.attitude], SO3)
         return reach * tips(states[..., layout.space.at[layout.attitude]])[..., 0, :]
 
 
-def _thinned(stage: Stage) -> Stage:
-    """The stage with `KEPT` equal particles in place of its cloud, taken evenly along the weights added up."""
-    belief: Particles = stage.belief
-    weights = belief.log_weights
-    if weights[0] == weights[-1] and weights.min() == weights.max():
-        chosen = np.arange(KEPT) * len(weights) // KEPT
-    else:
-        total = np.cumsum(np.exp(weights))
-        chosen = np.searchsorted(total, (np.arange(KEPT) + 0.5) / KEPT * total[-1])
-    thin = Particles(belief.space, belief.states[chosen], np.full(KEPT, -np.log(KEPT)))
-    changed: dict[str, Any] = {"belief": thin}
-    for field in dataclasses.fields(stage)[2:]:
-        value = getattr(stage, field.name)
-        if isinstance(value, np.ndarray) and value.shape[:1] == weights.shape:
-            changed[field.name] = value[chosen]
-    return dataclasses.replace(stage, **changed)
+def _descent_of(stage: Any, before: Array) -> tuple[Array, Array]:
+    """Of a resampling the states (L, n) of parents, a step before, and of the first child of each; of at most `_LINES`."""
+    ancestors = stage.ancestors
+    first = np.concatenate([[0], 1 + np.flatnonzero(ancestors[1:] != ancestors[:-1])])  # copies stand together
+    chosen = first[:: max(1, -(-len(first) // _LINES))]
+    return before.take(ancestors[chosen], axis=0), stage.belief.states.take(chosen, axis=0)
+
+
+def _thinned(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    """The stages with `KEPT` equal particles in place of their clouds, taken evenly along the weights added up. Before
+    a resampling they are the ancestors of those that are kept after it: chosen by their weight too."""
+    thin: list[Stage] = []
+    for stage, after in zip(stages, [*stages[1:], None], strict=True):
+        weights = stage.belief.log_weights
+        states: Array | None = None
+        if isinstance(after, Resample) and _equal(after.belief.log_weights):
+            chosen = after.ancestors[_evenly(len(weights))]
+        elif _equal(weights):
+            chosen = _evenly(len(weights))
+            if isinstance(stage, Resample) and thin:
+                states = thin[-1].belief.states
+                states = states if np.array_equal(states, stage.belief.states[chosen]) else None
+        else:
+            total = np.cumsum(np.exp(weights.astype(np.float32)), dtype=float)  # as near as a choice needs it
+            chosen = np.searchsorted(total, (np.arange(KEPT) + 0.5) / KEPT * total[-1])
+        if states is None:
+            states = stage.belief.states.take(chosen, axis=0)
+        changed: dict[str, Any] = {"belief": Particles(stage.belief.space, states, _EQUAL)}
+        for field in dataclasses.fields(stage)[2:]:
+            value = getattr(stage, field.name)
+            if isinstance(value, np.ndarray) and value.shape[:1] == weights.shape:
+                changed[field.name] = value.take(chosen, axis=0)
+        thin.append(dataclasses.replace(stage, **changed))
+    return tuple(thin)
+
+
+_EQUAL = np.full(KEPT, -np.log(KEPT))
+
+
+def _evenly(count: int) -> np.ndarray:
+    """`KEPT` of so many places, all as far apart."""
+    return np.arange(KEPT) * count // KEPT
+
+
+def _equal(log_weights: Array) -> bool:
+    return bool(log_weights[0] == log_weights[-1] and log_weights.min() == log_weights.max())
+
+
+def _own(rows: StageRows, what: dict[str, Any]) -> np.ndarray:
+    """Which rows hold a cloud that is neither the one before nor made of copies of it; all, where any does."""
+    if "same_as" not in what:
+        return np.ones(len(rows.at), bool)
+    held = rows.copied(what["same_as"][0]) if "by" in what else rows.shared("belief.states", *what["same_as"])
+    return np.full(len(held), not held.all())

@@ -135,13 +135,13 @@ def words(archetype: Any, component: str, kinds: Sequence[str], which: np.ndarra
 def _kind(archetype: Any, component: str) -> tuple[rr.ComponentDescriptor, pa.DataType]:
     """A component's descriptor and arrow type, learnt from a column that Rerun makes of one value."""
     one: list[Any] = [[1.0] * (4 if component.startswith("quaternion") else 3)]
-    if component in ("values", "variances", "colors"):
+    if component in ("values", "variances", "colors", "radii"):
         one = [0xFFFFFFFF] if component == "colors" else [1.0]
     (column,) = archetype.columns(**{component: one})
     return column.descriptor, column.component_batch.as_arrow_array().type
 
 
-def drawn(archetype: Any, counts: int | np.ndarray, rows: int, **components: Array) -> list[Column]:
+def drawn(archetype: Any, counts: int | np.ndarray, rows: int, **components: np.ndarray) -> list[Column]:
     """Components of an archetype, `counts` instances a row: what `archetype.columns(…).partition(…)` gives."""
     columns = []
     for name, values in components.items():

@@ -85,11 +85,8 @@ class Layout:
                 self._learn(rows)
                 new = True
         for rows in batch.stages:  # all stages are known now: one may hold what another drew
-            if self.particles and "belief.states" not in self.stages[rows.name] and len(rows.stages) > 1:
-                before = rows.before[-1]
-                if before is not None and before.belief.states is rows.stages[-1].belief.states:
-                    self.stages[rows.name]["belief.states"] = {"same_as": [before.name, "belief.states"]}
-                    new = True
+            if self.particles and "belief.states" not in self.stages[rows.name]:
+                new |= self._learn_states(rows)
             new |= self._learn_sources(rows)
         seen = dict.fromkeys(self.inputs)
         for tick in batch.ticks:
@@ -121,13 +118,25 @@ class Layout:
                 fields[field.name] = {"names": list(value)}
         self.stages[rows.name] = fields
 
+    def _learn_states(self, rows: StageRows) -> bool:
+        """Finds the particles that are those of the stage before, or copies of them: they are kept once."""
+        before = rows.before[-1]
+        if before is None or rows.first[-1]:
+            return False
+        fields, same = self.stages[rows.name], [before.name, "belief.states"]
+        if rows.shared("belief.states", *same)[-1]:
+            fields["belief.states"] = {"same_as": same}
+        elif "ancestors" in fields and rows.copied(before.name)[-1]:
+            fields["belief.states"] = {"same_as": same, "by": "ancestors"}
+        return "belief.states" in fields
+
     def _learn_sources(self, rows: StageRows) -> bool:
         """Finds the points that are those of the stage before (Kraft's filter maps its prediction's own): they are
         kept once."""
         new = False
         last, before = rows.stages[-1], rows.before[-1]
         for field, what in self.stages[rows.name].items():
-            if before is not None and "points" in what and "same_as" not in what:
+            if before is not None and not rows.first[-1] and "points" in what and "same_as" not in what:
                 for earlier, of in self.stages.get(before.name, {}).items():
                     if "points" in of and getattr(before, earlier) is getattr(last, field):
                         what["same_as"] = [before.name, earlier]

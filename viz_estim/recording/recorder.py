@@ -33,9 +33,9 @@ from viz_estim.recording.standing import Standing
 
 # A batch is cut by rows and bytes, which the same seed repeats; by time only where steps are so slow that a kill would
 # lose a second of them, or while a viewer watches.
-_ROWS = (250, 1000)  # at least, for each batch has its cost; and at most
-_BYTES = (3 << 20, 64 << 20)  # about, above the least rows; and in no case more
-_SECONDS = 0.6
+_ROWS = (400, 1000)  # at least, for each batch has its cost; and at most
+_BYTES = (2 << 20, 64 << 20)  # about, above the least rows; and in no case more
+_SECONDS = 0.7
 _SECONDS_WATCHED = 0.05
 
 
@@ -152,7 +152,7 @@ class Recorder:
 
     def _tick(self) -> None:
         written = 0
-        while not self._closed.wait(self._patience / 4):
+        while not self._closed.wait(self._patience / 8):
             try:
                 with self._lock:
                     if self._rows and time.monotonic() - self._oldest >= self._patience:

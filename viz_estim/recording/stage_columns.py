@@ -23,7 +23,7 @@ def stage_columns(layout: Layout, batch: Batch, rows: StageRows, every: int) -> 
         columns = _moments(rows, batch)
         states = fields.get("belief.states")
         columns += _thinned(rows, "belief.states", _own(rows, "belief.states", states, kept), "states")
-        columns += _thinned(rows, "belief.log_weights", kept, "log_weights")
+        columns += _log_weights(rows, kept)
     else:
         columns = [_column(rows, f"belief.{name}", name) for name in rows.stages[0].belief.shapes]
     for field, what in fields.items():
@@ -42,8 +42,21 @@ def stage_columns(layout: Layout, batch: Batch, rows: StageRows, every: int) -> 
 
 
 def _own(rows: StageRows, field: str, what: dict[str, list[str]] | None, kept: np.ndarray) -> np.ndarray:
-    """Which of the kept rows hold geometry that is not the stage before's own."""
-    return kept & ~rows.shared(field, *what["same_as"]) if what and "same_as" in what else kept
+    """Which of the kept rows hold geometry that is not the stage before's own, or copies of it."""
+    if not what or "same_as" not in what:
+        return kept
+    return kept & ~(rows.copied(what["same_as"][0]) if "by" in what else rows.shared(field, *what["same_as"]))
+
+
+def _log_weights(rows: StageRows, kept: np.ndarray) -> list[Column]:
+    """Those of clouds; one for all, where they are the same."""
+    values = rows.array("belief.log_weights")
+    equal = values[:, 0] == values[:, -1]
+    equal[equal] = (values[equal] == values[equal, :1]).all(1)
+    if not equal.any():
+        return [numbers(_STAGE, "log_weights", values, kept)] if kept.any() else []
+    found = [value[:1] if same else value for value, same in zip(values, equal, strict=True)]
+    return [numbers(_STAGE, "log_weights", [v if k else None for v, k in zip(found, kept, strict=True)])]
 
 
 def _moments(rows: StageRows, batch: Batch) -> list[Column]:

@@ -93,6 +93,9 @@ class Gathered:
         out = np.full((int(starts[-1]), size), np.nan)
         for chunk, lengths, flat in pieces:
             rows = np.flatnonzero(lengths == size)
+            if name == "log_weights" and size > 1 and (one := lengths == 1).any():  # one for all particles
+                out[starts[chunk] + np.flatnonzero(one)] = flat[np.repeat(one, lengths)][:, None]
+                flat = flat[np.repeat(~one, lengths)]
             out[starts[chunk] + rows] = flat.reshape(-1, size) if size else 0
             if fill and len(rows) and size:  # what all rows share is kept in the first alone
                 source = rows[np.maximum(np.searchsorted(rows, np.arange(counts[chunk]), side="right") - 1, 0)]
@@ -159,7 +162,12 @@ def fill_in(tables: dict[str, StageTable], fields: dict[str, Any]) -> None:
                 mine = table.values.setdefault(name, np.full((len(table.step), *theirs.shape[1:]), np.nan))
                 row = np.minimum(np.searchsorted(source.step, table.step), len(source.step) - 1)
                 lacking = np.isnan(mine).all((1, 2)) & (source.step[row] == table.step)
-                mine[lacking] = theirs[row[lacking]]
+                values = theirs[row[lacking]]
+                if "by" in what:
+                    chosen = table.values[what["by"]][lacking]
+                    known = np.isfinite(chosen).all(1)
+                    values[known] = np.take_along_axis(values[known], chosen[known].astype(int)[..., None], axis=1)
+                mine[lacking] = values
 
 
 def _column_of(field: str) -> str:
