@@ -55,11 +55,21 @@ class Particles:
     states: Array
     log_weights: Array
     _moments: tuple[Array, Array] | None = field(default=None, init=False, repr=False, compare=False)
+    _weights: Array | None = field(default=None, init=False, repr=False, compare=False)
+    _ess: Array | None = field(default=None, init=False, repr=False, compare=False)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         count, n = self.states.shape[-2:]
         return {"states": (count, n), "log_weights": (count,)}
+
+    @property
+    def weights(self) -> Array:
+        """(*, N), which sum to one; worked out when first asked for."""
+        if self._weights is None:
+            object.__setattr__(self, "_weights", np.exp(self.log_weights))
+        assert self._weights is not None
+        return self._weights
 
     @property
     def mean(self) -> Array:
@@ -74,7 +84,10 @@ class Particles:
     @property
     def ess(self) -> Array:
         """The effective sample size 1/Σw² (*,), from 1 to N (Kong, Liu and Wong 1994)."""
-        return np.asarray(1 / np.square(np.exp(self.log_weights)).sum(-1))
+        if self._ess is None:
+            object.__setattr__(self, "_ess", np.asarray(1 / np.square(self.weights).sum(-1)))
+        assert self._ess is not None
+        return self._ess
 
     def modes(self, least: float = 0.05) -> tuple[Mode, ...]:
         """The modes of one cloud (no batch) that hold at least a share `least` of its weight, the heaviest first."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -46,16 +47,24 @@ def weigh(belief: Particles, log_likelihood: LogLikelihood, tick: Tick, *, name:
     """
     log_likelihoods = np.maximum(log_likelihood(belief.states, tick), LOG_ZERO)  # log 0 is a number here
     log_weights = belief.log_weights + log_likelihoods
-    best = log_weights.max(axis=-1, keepdims=True)
+    best = np.maximum.reduce(log_weights, axis=-1, keepdims=True)
     if not (best > LOG_ZERO / 2).all():  # nor NaN
         raise ArithmeticError("no particle has a likelihood above 0: none can give what was read")
     weights = np.exp(log_weights - best)
-    total = weights.sum(axis=-1)
+    total = np.add.reduce(weights, axis=-1)
     evidence = best[..., 0] + np.log(total)
     log_weights -= evidence[..., None]
-    ess = total**2 / np.square(weights).sum(axis=-1)
     after = Particles(belief.space, belief.states, log_weights)
-    return Weigh(name, after, log_likelihoods, np.asarray(evidence), np.asarray(ess))
+    weights /= total[..., None]
+    object.__setattr__(after, "_weights", weights)  # so that a resampling need not take exponentials again
+    return Weigh(name, after, log_likelihoods, np.asarray(evidence), after.ess)
+
+
+@lru_cache(maxsize=8)
+def _equal_log_weights(N: int) -> Array:
+    log_weights = np.full(N, -np.log(N))
+    log_weights.flags.writeable = False  # many beliefs share it
+    return log_weights
 
 
 @names_its_failures
@@ -71,19 +80,18 @@ def resample(
 
     where (*,): the members of a batch that are resampled; the others stay as they are, each its own ancestor.
     """
-    weights = np.exp(belief.log_weights)
-    ess = np.asarray(1 / np.square(weights).sum(axis=-1))
+    weights = belief.weights
     copies = METHODS[method](weights, rng)
     N, n = belief.states.shape[-2:]
-    log_weights = np.full(weights.shape, -np.log(N))
+    log_weights = _equal_log_weights(N) if copies.ndim == 1 else np.full(weights.shape, -np.log(N))
     if where is not None:
         copies = np.where(where[..., None], copies, 1)
         log_weights = np.where(where[..., None], log_weights, belief.log_weights)
     chosen = np.repeat(np.arange(copies.size), copies.ravel())
     states = belief.states.reshape(-1, n).take(chosen, axis=0).reshape(belief.states.shape)
     ancestors = (chosen if copies.ndim == 1 else chosen % N).reshape(copies.shape)
-    distinct = np.asarray((copies > 0).sum(axis=-1), float)
-    return Resample(name, Particles(belief.space, states, log_weights), ancestors, distinct, ess)
+    distinct = np.asarray(np.count_nonzero(copies, axis=-1), float)
+    return Resample(name, Particles(belief.space, states, log_weights), ancestors, distinct, belief.ess)
 
 
 @dataclass(frozen=True)

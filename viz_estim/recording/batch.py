@@ -68,6 +68,13 @@ class StageRows:
         found: np.ndarray = self._gathered[key]
         return found
 
+    @cached_property
+    def equal_weights(self) -> np.ndarray:
+        """Which rows' particles weigh all the same."""
+        found = self.objects("belief.log_weights")
+        alike = {id(one): bool((one == one[0]).all()) for one in {id(one): one for one in found}.values()}
+        return np.array([alike[id(one)] for one in found])
+
     def copied(self, stage: str) -> np.ndarray:
         """Which rows hold the particles that their `ancestors` name of the stage before, to the bit, if it is that one
         in the same step."""

@@ -70,15 +70,15 @@ class Clouds:
         kept = np.flatnonzero(rows.at.step % self._every == 0)
         if not len(kept):
             return
-        at, every = rows.at.pick(kept), len(kept) == len(rows.at)
+        at = rows.at.pick(kept)
         kind = rr.Arrows3D if self._turned else rr.Points3D
-        log_weights = rows.array("belief.log_weights") if every else rows.array("belief.log_weights")[kept]
-        N = log_weights.shape[1]
+        N = len(rows.stages[0].belief.log_weights)
         what = self._layout.stages[rows.name].get("belief.states", {})
         same, own = what.get("same_as"), _own(rows, what)[kept]
         columns = []
         if own.any():
-            states = rows.array("belief.states") if every else rows.array("belief.states")[kept]
+            states = rows.array("belief.states")
+            states = states if len(kept) == len(states) else states[kept]
             places = self._places(states)
             shown = {"origins": places, "vectors": self._ahead(states)} if self._turned else {"positions": places}
             columns += drawn(kind, N, len(at), **shown)
@@ -90,11 +90,12 @@ class Clouds:
                     named[row, getattr(rows.stages[i], what["by"])] = True
                 radius = np.where(named, radius, np.float32(0))
             columns += drawn(kind, radius.shape[1], len(at), radii=radius)
-        heaviest = log_weights.max(axis=1, keepdims=True)
-        if (log_weights == heaviest).all():
+        if rows.equal_weights.all():
             columns += drawn(kind, 1, len(at), colors=np.full(len(at), schema.by_weight(np.ones(1))))
         else:
-            columns += drawn(kind, N, len(at), colors=schema.by_weight(np.exp((log_weights - heaviest).astype("f4"))))
+            share = rows.array("belief.log_weights")[kept].astype(np.float32)
+            share -= share.max(axis=1, keepdims=True)
+            columns += drawn(kind, N, len(at), colors=schema.by_weight(np.exp(share)))
         send(self._stream, self._path, at, columns)
 
     def _draw_descent(self, batch: Batch, rows: StageRows) -> None:
@@ -166,7 +167,7 @@ class Clouds:
 
 
 def _descent_of(stage: Any, before: Array) -> tuple[Array, Array]:
-    """Of a resampling the states (L, n) of parents, a step before, and of the first child of each; of at most `_LINES`."""
+    """Of a resampling, the states (L, n) of parents, a step before, and of their first children; `_LINES` at most."""
     ancestors = stage.ancestors
     first = np.concatenate([[0], 1 + np.flatnonzero(ancestors[1:] != ancestors[:-1])])  # copies stand together
     chosen = first[:: max(1, -(-len(first) // _LINES))]

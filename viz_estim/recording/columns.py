@@ -117,6 +117,14 @@ def numbers(archetype: str, component: str, rows: Array | list[Any], known: np.n
     return _column(_named(archetype, component), pa.array(flat), counts, len(rows))
 
 
+def indices(archetype: str, component: str, rows: list[Any]) -> Column:
+    """Whole numbers that count rows of something, in half a float's space; rows may be None or of several lengths."""
+    present = [np.asarray(row, np.int32).ravel() for row in rows if row is not None]
+    flat = np.concatenate(present) if present else np.empty(0, np.int32)
+    counts = np.array([0 if row is None else np.size(row) for row in rows])
+    return _column(_named(archetype, component), pa.array(flat), counts, len(rows))
+
+
 def once(archetype: str, component: str, value: Array, rows: int) -> Column:
     """One value that all rows share, kept in the first of them alone: the reader fills the others in."""
     flat = np.asarray(value, float).ravel()

@@ -34,7 +34,7 @@ from viz_estim.recording.standing import Standing
 # A batch is cut by rows and bytes, which the same seed repeats; by time only where steps are so slow that a kill would
 # lose a second of them, or while a viewer watches.
 _ROWS = (400, 1000)  # at least, for each batch has its cost; and at most
-_BYTES = (2 << 20, 64 << 20)  # about, above the least rows; and in no case more
+_BYTES = (2 << 20, 16 << 20)  # about, above the least rows; and in no case more
 _SECONDS = 0.7
 _SECONDS_WATCHED = 0.05
 
@@ -228,14 +228,13 @@ def partial_of(path: Path) -> Path:
 
 
 def _size(step: Step) -> int:
-    """About the bytes of a step: what its arrays hold."""
-    total = 0
-    for stage in step.stages:
-        pending: list[Any] = [getattr(stage, field.name) for field in dataclasses.fields(stage)]
-        while pending:
-            value = pending.pop()
-            if isinstance(value, np.ndarray):
-                total += value.nbytes
-            elif dataclasses.is_dataclass(value):
-                pending += [getattr(value, field.name) for field in dataclasses.fields(value)]
-    return total
+    """About the bytes of a step: what its arrays hold, each counted once."""
+    held: dict[int, int] = {}
+    pending: list[Any] = list(step.stages)
+    while pending:
+        value = pending.pop()
+        if isinstance(value, np.ndarray):
+            held[id(value)] = value.nbytes
+        elif dataclasses.is_dataclass(value):
+            pending += [getattr(value, field.name) for field in dataclasses.fields(value) if field.init]
+    return sum(held.values())

@@ -9,7 +9,7 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.stages import Innovation, Matches
 from viz_estim.recording.batch import Batch, StageRows
-from viz_estim.recording.columns import Column, numbers, once
+from viz_estim.recording.columns import Column, indices, numbers, once
 from viz_estim.recording.layout import Layout
 
 _STAGE = "viz_estim.Stage"
@@ -31,11 +31,11 @@ def stage_columns(layout: Layout, batch: Batch, rows: StageRows, every: int) -> 
             columns += _thinned(rows, f"{field}.points", _own(rows, field, what, kept))
         elif "matches" in what:
             for part in Matches.__slots__:
-                columns += _thinned(rows, f"{field}.{part}", kept)
+                columns += (_indices if part.endswith("_index") else _thinned)(rows, f"{field}.{part}", kept)
         elif "innovation" in what:
             columns += [_column(rows, f"{field}.{part}") for part in Innovation.__slots__ if part != "space"]
         elif "cloud" in what:
-            columns += _thinned(rows, field, kept)
+            columns += (_indices if field == "ancestors" else _thinned)(rows, field, kept)
         elif "shape" in what:
             columns.append(_column(rows, field))
     return columns
@@ -50,13 +50,11 @@ def _own(rows: StageRows, field: str, what: dict[str, list[str]] | None, kept: n
 
 def _log_weights(rows: StageRows, kept: np.ndarray) -> list[Column]:
     """Those of clouds; one for all, where they are the same."""
-    values = rows.array("belief.log_weights")
-    equal = values[:, 0] == values[:, -1]
-    equal[equal] = (values[equal] == values[equal, :1]).all(1)
-    if not equal.any():
-        return [numbers(_STAGE, "log_weights", values, kept)] if kept.any() else []
-    found = [value[:1] if same else value for value, same in zip(values, equal, strict=True)]
-    return [numbers(_STAGE, "log_weights", [v if k else None for v, k in zip(found, kept, strict=True)])]
+    weights = zip(rows.objects("belief.log_weights"), rows.equal_weights, strict=True)
+    found: list[Any] = [one[:1] if equal else one for one, equal in weights]
+    if not kept.all():
+        found = [one if keep else None for one, keep in zip(found, kept, strict=True)]
+    return [numbers(_STAGE, "log_weights", found)] if kept.any() else []
 
 
 def _moments(rows: StageRows, batch: Batch) -> list[Column]:
@@ -77,6 +75,12 @@ def _thinned(rows: StageRows, path: str, kept: np.ndarray, name: str | None = No
     if isinstance(values, list):
         values = [value if keep else None for value, keep in zip(values, kept, strict=True)]
     return [numbers(_STAGE, name or path, values, kept)]
+
+
+def _indices(rows: StageRows, path: str, kept: np.ndarray) -> list[Column]:
+    """Which rows of a cloud a stage names, in the rows where they are kept."""
+    values = [value if keep else None for value, keep in zip(rows.objects(path), kept, strict=True)]
+    return [indices(_STAGE, path, values)] if kept.any() else []
 
 
 def _column(rows: StageRows, path: str, name: str | None = None) -> Column:
