@@ -1,11 +1,13 @@
 """The particle filter and ICP against plain numpy and FilterPy: `python tests/bench/clouds.py` prints a table.
 
-Needs `pip install -e .[bench]`.
+Needs `pip install -e .[bench]`; beside `particles` too where that is installed (0.4 asks for numpy below 2 and runs with
+2: `pip install numba joblib scikit-learn && pip install --no-deps particles==0.4`).
 """
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +18,18 @@ from scipy.spatial import cKDTree
 from speed import in_turn
 
 from viz_estim.core.quaternions import Array
-from viz_estim.core.run import run
+from viz_estim.core.run import Scenario, run
 from viz_estim.scenarios.scan import scan, scan_icp
+
+try:
+    import particles
+except ImportError:
+    particles = None
 
 
 def particle_filter(count: int, folder: Path) -> Rows:
     """beacons-pf's model in a plain loop with searchsorted, and with FilterPy's resampling."""
-    scenario = built("beacons-pf", f"particles={count}", f"data.duration={60 if count < 10_000 else 6}")
+    scenario = built("beacons-pf", f"particles={count}", f"data.duration={300 if count < 10_000 else 12}")
     pf: Any = scenario.estimator
     start, ticks = scenario.beliefs[0], scenario.ticks
 
@@ -44,21 +51,42 @@ def particle_filter(count: int, folder: Path) -> Rows:
         for _ in run(scenario):
             pass
 
-    plain, mine, kept, filterpys = in_turn(
+    plain, mine, kept, filterpys, theirs = in_turn(
         lambda: loop(by_searchsorted), ours, lambda: recorded(scenario, folder),
-        lambda: loop(lambda w, rng: systematic_resample(w)),
+        lambda: loop(lambda w, rng: systematic_resample(w)), by_particles(scenario, count),
     )  # fmt: skip
     bound = 1.6 if count < 10_000 else 1.15
     each = 1e6 * mine / len(ticks)
     return [
         (f"PF, N = {count}, / a numpy loop", f"{mine / plain:.2f} (≤ 1.15)", f"{each:.0f} µs a step"),
         (f"PF, N = {count}, / FilterPy's resampling", f"{mine / filterpys:.2f} (< 1)", ""),
+        (f"PF, N = {count}, / particles", f"{mine / theirs:.2f} (< 1)" if particles else "not installed", ""),
         (
             f"PF, N = {count}, recorded / itself",
             f"{kept / mine:.2f} (≤ {bound})",
             f"{1e6 * kept / len(ticks):.0f} µs a step",
         ),
     ]
+
+
+def by_particles(scenario: Scenario, count: int) -> Callable[[], object]:
+    """The same filter by `particles` (Chopin and Papaspiliopoulos 2020), resampled at every step."""
+    if particles is None:
+        return lambda: None
+    pf: Any = scenario.estimator
+    ticks, rng = scenario.ticks, np.random.default_rng(0)
+
+    class Bootstrap(particles.FeynmanKac):  # type: ignore[name-defined,misc]
+        def M0(self, N: int) -> Array:
+            return scenario.beliefs[0].states
+
+        def M(self, t: int, xp: Array) -> Array:
+            return pf.propagate(xp, ticks[t], rng)
+
+        def logG(self, t: int, xp: Array, x: Array) -> Array:
+            return pf.log_likelihood(x, ticks[t])
+
+    return lambda: particles.SMC(fk=Bootstrap(len(ticks)), N=count, resampling="systematic", ESSrmin=1.0).run()
 
 
 def icp(folder: Path) -> Rows:

@@ -87,7 +87,7 @@ def ekf(folder: Path) -> Rows:
 
 def ukf(folder: Path) -> Rows:
     """The 15-state UKF, 55 points, beside FilterPy's with 31 points on the same motion; and recorded."""
-    scenario = built("quadrotor-ukf-pose", "data.duration=20")
+    scenario = built("quadrotor-ukf-pose", "data.duration=60")
     kf: Any = scenario.estimator
     start, ticks = scenario.beliefs[0], scenario.ticks
     n = len(start.mean) - 1  # FilterPy's state is flat: the attitude as a rotation vector from the start

@@ -85,7 +85,7 @@ class Particles:
     def ess(self) -> Array:
         """The effective sample size 1/Σw² (*,), from 1 to N (Kong, Liu and Wong 1994)."""
         if self._ess is None:
-            object.__setattr__(self, "_ess", np.asarray(1 / np.square(self.weights).sum(-1)))
+            object.__setattr__(self, "_ess", np.asarray(1 / np.vecdot(self.weights, self.weights)))
         assert self._ess is not None
         return self._ess
 

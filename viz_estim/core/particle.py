@@ -90,7 +90,7 @@ def resample(
     chosen = np.repeat(np.arange(copies.size), copies.ravel())
     states = belief.states.reshape(-1, n).take(chosen, axis=0).reshape(belief.states.shape)
     ancestors = (chosen if copies.ndim == 1 else chosen % N).reshape(copies.shape)
-    distinct = np.asarray(np.count_nonzero(copies, axis=-1), float)
+    distinct = np.asarray(np.count_nonzero(copies, axis=-1 if copies.ndim > 1 else None), float)
     return Resample(name, Particles(belief.space, states, log_weights), ancestors, distinct, belief.ess)
 
 

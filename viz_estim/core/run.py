@@ -148,8 +148,11 @@ def run(scenario: Scenario, seed: int = 0, *, first: int = 0, belief: Belief | N
 
 def _finite(values: Array, before: Array) -> bool:
     """Whether all values are; those that the belief before held have been looked at."""
-    # A finite sum has finite terms, and is quicker to see; one that is not may have overflowed.
-    return values is before or isfinite(np.add.reduce(values, axis=None)) or bool(np.isfinite(values).all())
+    if values is before:
+        return True
+    # A finite sum of squares has finite terms, and is quicker to see; one that is not may have overflowed.
+    flat = values.ravel()
+    return isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
 
 
 def _check_shapes(stage: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
