@@ -21,7 +21,7 @@ from viz_estim.recording.layout import KEPT, Layout, place_of
 from viz_estim.recording.standing import Standing
 
 _LINES = 400  # of ancestry, at most
-_LOOKS = 50  # how often in a run its modes are looked for: that takes longer than a step of a small filter
+_LOOKS = 75  # how often in a run its modes are looked for: that takes longer than a step of a small filter
 
 
 class Clouds:
