@@ -14,17 +14,17 @@ from viz_estim.core.spaces import SE2, Space
 from viz_estim.recording import schema
 from viz_estim.recording.compared import Compared
 from viz_estim.recording.layout import flat3, is_position, place_of
-from viz_estim.recording.overlays import Plot
 from viz_estim.recording.pictures import CANVAS, PANORAMA
+from viz_estim.recording.sheet import Plot
 
 _Item = rrb.Container | rrb.View
 _PLAIN: dict[str, Any] = {"background": [13, 14, 16]}
 _NO_SCENES = {"stages", "steps", "events", "lanes"}
-_ROWS = 3  # of plots that one tab holds, beneath the scenes
+_FEW = 3  # runs up to which a plot has room for their legend
 _NAMES = {"attitude": "attitude", "world": "world [m]", "bars": "probabilities", "canvas": "mosaic [deg]"}
 _TABS = {
-    "difference": "Difference", "belief": "Belief", "error": "Errors", "state": "State", "sigma": "σ",
-    "innovation": "Innovations", "nis": "NIS", "figure": "Figures",
+    "difference": "Difference", "belief": "Belief", "error": "Errors", "state": "State, truth white", "sigma": "σ",
+    "innovation": "Innovations", "nis": "NIS", "moved": "What moved it", "figure": "Figures",
 }  # fmt: skip
 
 
@@ -80,8 +80,9 @@ def build(runs: list[Compared], scenes: Scenes, plots: list[Plot]) -> rrb.Bluepr
     """Scenes above, by kind in tabs where there are several; plots beneath in tabs, with lanes and the figures."""
     above = _scenes(runs, scenes)
     beneath: list[_Item] = []
-    for tab, members in groupby(plots, key=lambda plot: plot.tab):
-        beneath += _tabs(_TABS[tab], list(members))
+    for tab in _TABS:
+        if members := [plot for plot in plots if plot.tab == tab]:
+            beneath += _tabs(_TABS[tab], members, len(runs), named=bool(above))
     lanes = [
         rrb.StateTimelineView(
             origin=f"{run.path}{schema.LANES}", name=f"{run.title}: stage, and each sensor's readings"
@@ -107,19 +108,21 @@ def _scenes(runs: list[Compared], scenes: Scenes) -> list[_Item]:
     for scene in dict.fromkeys(scene for scene in order if scene in scenes.runs):
         holders = [runs[i] for i in scenes.runs[scene]]
         word = _NAMES.get(scene[1:], scene[1:].removeprefix("sensors/"))
-        views = [_view(scene, [one], runs[0], scenes, f"{one.title}: {word}") for one in holders]
+        across = len(holders) if len(holders) <= 3 else -(-len(holders) // 2)
+        wide = (4.2 if len(holders) <= 3 else 7.0) / across  # a view's width by its height in a window of 1.6
+        views = [_view(scene, [one], runs[0], scenes, f"{one.title}: {word}", wide) for one in holders]
         if scene == CANVAS and scenes.panorama:
             views.append(_flat(f"{runs[0].path}{PANORAMA}", None, scenes.sizes.get(PANORAMA), "True world [deg]"))
-        across = len(views) if len(views) <= 3 else -(-len(views) // 2)
+            across = len(views) if len(views) <= 3 else -(-len(views) // 2)
         found.append(rrb.Grid(*views, grid_columns=across, name=word.capitalize()))
         if scene in (schema.WORLD, schema.ATTITUDE) and len(holders) > 1:
             title = ", ".join(one.title for one in holders)
-            found.append(_view(scene, holders, runs[0], scenes, f"{word.capitalize()} overlaid: {title}"))
+            found.append(_view(scene, holders, runs[0], scenes, f"{word.capitalize()} overlaid: {title}", 4.2))
     return found
 
 
-def _view(scene: str, holders: list[Compared], first: Compared, scenes: Scenes, name: str) -> rrb.View:
-    """A scene of one run, or of several in one; with the first run's truth where they share it."""
+def _view(scene: str, holders: list[Compared], first: Compared, scenes: Scenes, name: str, wide: float) -> rrb.View:
+    """A scene of one run, or of several in one; with the first run's truth where they share it. wide: by its height."""
     contents = []
     for one in holders:
         inside = f"{one.path}{scene}"
@@ -133,7 +136,8 @@ def _view(scene: str, holders: list[Compared], first: Compared, scenes: Scenes, 
         return _flat(origin, contents, scenes.sizes.get(scene), name)
     trail: Any = {f"{one.path}{scene}/estimate/trail": [rrb.VisibleTimeRanges(_since_start())] for one in holders}
     return rrb.Spatial3DView(
-        origin=origin, contents=contents, name=name, eye_controls=_eye(scene, holders, first, scenes), line_grid=False,
+        origin=origin, contents=contents, name=name, eye_controls=_eye(scene, holders, first, scenes, wide),
+        line_grid=False,
         overrides=trail if scene == schema.WORLD else {}, **_PLAIN,
     )  # fmt: skip
 
@@ -154,7 +158,7 @@ def _since_start() -> list[rrb.VisibleTimeRange]:
     return [rrb.VisibleTimeRange(timeline, start=start, end=now) for timeline in ("step", "time", "stage")]
 
 
-def _eye(scene: str, holders: list[Compared], first: Compared, scenes: Scenes) -> rrb.EyeControls3D:
+def _eye(scene: str, holders: list[Compared], first: Compared, scenes: Scenes, wide: float) -> rrb.EyeControls3D:
     """The same for all runs: the first's places decide."""
     if scene == schema.BARS:
         count = max(len(one.run.labels) for one in holders)
@@ -172,7 +176,8 @@ def _eye(scene: str, holders: list[Compared], first: Compared, scenes: Scenes) -
     low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.ones(3))
     (x, y, z), reach = 0.5 * (low + high), max(0.5, float(0.5 * np.abs(high - low).max()))
     if low[2] == high[2]:
-        height = 2.4 * max(0.5, 0.5 * (high - low)[1], 0.4 * (high - low)[0])  # the views are wider than high
+        # The eye sees about as much upwards as it is away, and `wide` times that across; a fifth is left as a margin.
+        height = 1.25 * max(1.0, (high - low)[1], (high - low)[0] / wide)
         return rrb.EyeControls3D(position=[x, y, height], look_target=[x, y, 0], eye_up=[0, 1, 0], kind="Orbital")
     place = [x + 1.5 * reach, y - 1.85 * reach, z + 1.25 * reach]
     return rrb.EyeControls3D(position=place, look_target=[x, y, z], eye_up=[0, 0, 1], kind="Orbital")
@@ -197,22 +202,30 @@ def _places(one: Compared) -> Array:
     return np.empty((0, 3))
 
 
-def _tabs(title: str, plots: list[Plot]) -> list[_Item]:
-    """Plots in rows, those of one part of the state together; in as many tabs as keep them readable."""
-    rows: list[tuple[str, list[_Item]]] = []
+def _tabs(title: str, plots: list[Plot], runs: int, *, named: bool) -> list[_Item]:
+    """Plots in rows, those of one part of the state together; in as many tabs as keep them readable.
+
+    One legend a tab, in its first plot; of many runs where it has a row for itself, or where no scene above names them.
+    """
+    rows: list[tuple[str, list[Plot]]] = []
     for name, members in groupby(plots, key=lambda plot: plot.row):
-        views: list[_Item] = [_plot(plot, legend=i == 0) for i, plot in enumerate(members)]
+        views = list(members)
         if rows and len(rows[-1][1]) + len(views) <= 4 and len(views) < 3:
             rows[-1] = (f"{rows[-1][0]}, {name}", rows[-1][1] + views)
             continue
         across = 3 if len(views) % 3 == 0 else 4
         rows += [(name, views[i : i + across]) for i in range(0, len(views), across)]
-    count = -(-len(rows) // _ROWS)
+    count = -(-len(rows) // (3 if runs <= _FEW else 2))
     size = -(-len(rows) // count)
     found: list[_Item] = []
     for i in range(0, len(rows), size):
-        names = ", ".join(dict.fromkeys(name for name, _ in rows[i : i + size]))
-        lines = [rrb.Horizontal(*views) for _, views in rows[i : i + size]]
+        some = rows[i : i + size]
+        legend = runs <= _FEW or len(some[0][1]) == 1 or not named
+        names = ", ".join(dict.fromkeys(name for name, _ in some))
+        lines = [
+            rrb.Horizontal(*(_plot(plot, legend=legend and plot is some[0][1][0]) for plot in members))
+            for _, members in some
+        ]
         found.append(rrb.Vertical(*lines, name=f"{title}: {names}" if count > 1 else title))
     return found
 

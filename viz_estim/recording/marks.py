@@ -5,6 +5,7 @@ A click on a row's time in the list moves the time cursor there; a link in the t
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -48,7 +49,9 @@ def lane(mark: Mark) -> str:
 
 def write(source: Path, path: Path, run: Run, marks: list[Mark], markdown: str) -> None:
     """Copies the recording at `source`, which holds `run`, to `path`, whole or not at all, with the marks in it."""
-    with whole_file(path) as aside, rr.RecordingStream("viz_estim diagnose", send_properties=False) as stream:
+    # A view belongs to an application id: diagnoses that are open in one viewer keep their own.
+    application = "viz_estim diagnose " + re.sub(r"[^A-Za-z0-9_-]+", "-", source.stem)
+    with whole_file(path) as aside, rr.RecordingStream(application, send_properties=False) as stream:
         stream.save(aside)
         stream.send_recording_name(f"{run.properties.get('title', source.stem)} · diagnosis")
         stream.flush()  # what is logged so far comes before all chunks

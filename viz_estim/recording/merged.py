@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,7 +32,9 @@ def write(path: Path, runs: list[Compared], result: dict[str, Any], notes: str) 
     that is the first run's is kept there alone. What is over time is drawn over all of them at once, from the runs'
     numbers. result: kept as a property; notes: markdown.
     """
-    with whole_file(path) as aside, rr.RecordingStream("viz_estim compare", send_properties=False) as stream:
+    # A view belongs to an application id: comparisons that are open in one viewer keep their own.
+    application = "viz_estim compare " + re.sub(r"[^A-Za-z0-9_-]+", "-", " ".join(run.name for run in runs))
+    with whole_file(path) as aside, rr.RecordingStream(application, send_properties=False) as stream:
         stream.save(aside)
         stream.send_recording_name(" · ".join(run.name for run in runs))
         stream.flush()  # what is logged so far comes before all chunks
