@@ -12,7 +12,6 @@ from viz_estim.core.spaces import Product
 from viz_estim.recording.compared import Compared, shared_parts
 from viz_estim.recording.reader import Run
 
-
 NONE = "–"  # the cell of a run that has no such figure
 
 
