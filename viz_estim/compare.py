@@ -12,8 +12,9 @@ from viz_estim import comparison_table
 from viz_estim.differences import Difference, first_difference, other_data
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable
-from viz_estim.recording import merged
+from viz_estim.recording import merged, schema
 from viz_estim.recording.compared import COLOURS, Compared, light
+from viz_estim.recording.links import link
 from viz_estim.recording.reader import Run, load
 
 
@@ -52,7 +53,8 @@ def compare(paths: list[Path], out: Path | None, tol: float) -> tuple[dict[str, 
     }  # fmt: skip
     table = comparison_table.rows(compared, figures)
     verdicts = _verdicts(compared, found, reasons, tol)
-    notes = "\n".join([*(f"- {line}" for line in verdicts), "", comparison_table.markdown(names, table)])
+    listed = [f"- {_linked(line, compared[0], one)}" for line, one in zip(verdicts, found[1:], strict=True)]
+    notes = "\n".join([*listed, "", comparison_table.markdown(names, table)])
     merged.write(path, compared, result, notes)
     lines = comparison_table.text(names, table, shutil.get_terminal_size((120, 24)).columns)
     return result, "\n".join([*lines, *verdicts, f"viz-estim open {path}"])
@@ -98,6 +100,15 @@ def _verdicts(
             where = f"step {difference.step} ({time:.4f} s), stage {difference.stage}"
             lines.append(f"{one.name} parts from {first.name} first at {where}: {_worded(difference)}")
     return lines
+
+
+def _linked(verdict: str, first: Compared, one: Difference | None) -> str:
+    """The line with its step as a link there."""
+    if one is None:
+        return verdict
+    step, run = f"step {one.step}", first.run
+    entity = first.path + (schema.stage(one.stage) if one.stage in run.stages else schema.STEPS)
+    return verdict.replace(f"{step} ", link(step, entity, float(run.time[run.row(step=one.step)])) + " ", 1)
 
 
 def _worded(one: Difference) -> str:

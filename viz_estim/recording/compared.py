@@ -86,6 +86,14 @@ class Compared:
         return max((int(table.place.max()) for table in self.run.stages.values() if len(table.place)), default=-1)
 
 
+class Alone(Compared):
+    """A run that is compared with none: its entities stand where it recorded them."""
+
+    @property
+    def path(self) -> str:
+        return ""
+
+
 class Clock:
     """Puts another run's rows on the first run's steps and places, by their stamps, so that one cursor moves both."""
 
