@@ -1,5 +1,9 @@
-"""What a real headless viewer shows of a comparison: every view draws, and none is empty, for two to six runs."""
+"""What a real headless viewer shows of comparisons, for two to six runs, and of a diagnosis: every view draws, none is
+empty, and the panels' links jump."""
 
+import json
+import re
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,6 +12,7 @@ import pytest
 from conftest import SHORTEST, Cli
 from test_pictures import emptiness, picture
 
+import viz_estim
 from viz_estim.recording.viewer import Viewer
 
 pytestmark = pytest.mark.draws
@@ -23,7 +28,7 @@ KINDS: dict[str, list[list[str]]] = {
     "clouds": [_CLOUD, [*_CLOUD, "--set=range_noise=2"]],
 }
 AT = {"attitudes": 2.5, "six robots": 2.0, "three bars": 30.0, "clouds": 2.0}
-SIZE, HEAD, FOOT = (1400, 1000), 31, 28  # a window, and what the viewer takes of it above and below the views
+SIZE, HEAD, FOOT = (1100, 800), 31, 28  # a window, and what the viewer takes of it above and below the views
 
 
 @pytest.fixture(scope="module")
@@ -40,10 +45,43 @@ def test_every_view_of_a_comparison_draws_and_none_is_empty(
     for arguments, file in zip(KINDS[kind], files, strict=True):
         assert cli("run", *arguments, "--out", file).code == 0
     assert cli("compare", *files, "--out", tmp_path / "all.rrd").code == 1
-    viewer.open(tmp_path / "all.rrd")
+    assert_all_drawn(viewer, tmp_path / "all.rrd", AT[kind])
+
+
+def test_every_view_of_a_diagnosis_draws_and_its_links_jump(
+    viewer: Viewer, cli: Cli, recording: Path, tmp_path: Path
+) -> None:
+    findings = json.loads(cli("diagnose", recording, "--out", tmp_path / "marked.rrd", "--json").out)["findings"]
+    assert_all_drawn(viewer, tmp_path / "marked.rrd", 3.0)
+    run = viz_estim.load(recording)
+    for url, finding in list(zip(links(viewer), findings, strict=True))[:3]:
+        assert url.startswith("rerun+http://127.0.0.1:")
+        viewer._client.open(url)  # what the viewer does at a click
+        expected = round(1e9 * run.time[run.row(step=finding["steps"][0])])
+        deadline = time.monotonic() + 5
+        while (now := cursor(viewer)) != ("time", expected) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert now == ("time", expected)
+
+
+def links(viewer: Viewer) -> list[str]:
+    """The addresses in the text panels of the recording in front."""
+    texts = [fields.get("TextDocument", {}) for fields in viewer._client.get_blueprint().blueprint.values()]
+    return [url for text in texts if text for url in re.findall(r"\]\(([^)]*)\)", text["text"])]
+
+
+def cursor(viewer: Viewer) -> tuple[str, int]:
+    state = viewer._client.get_state()
+    (front,) = [recording for recording in state.recordings if recording.store_id == state.active_recording]
+    return front.current_timeline, front.current_time
+
+
+def assert_all_drawn(viewer: Viewer, path: Path, at: float) -> None:
+    """At a time, all views of all tabs draw without a complaint, and show something."""
+    viewer.open(path)
     cells = side_by_side(viewer)
-    viewer.seek("time", AT[kind])
-    assert viewer.snapshot(tmp_path / "settled.png")
+    viewer.seek("time", at)
+    assert viewer.snapshot(path.with_suffix(".png"), settle=30)
     assert viewer.problems() == []
     assert len(viewer.views()) == len(cells)
     pixels = picture(viewer)
