@@ -28,7 +28,7 @@ KINDS: dict[str, list[list[str]]] = {
     "clouds": [_CLOUD, [*_CLOUD, "--set=range_noise=2"]],
 }
 AT = {"attitudes": 2.5, "six robots": 2.0, "three bars": 30.0, "clouds": 2.0}
-SIZE, HEAD, FOOT = (1100, 800), 31, 28  # a window, and what the viewer takes of it above and below the views
+SIZE, HEAD, FOOT = (1100, 800), 37, 28  # a window, and what the viewer takes of it above and below the views
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +46,8 @@ def test_every_view_of_a_comparison_draws_and_none_is_empty(
         assert cli("run", *arguments, "--out", file).code == 0
     assert cli("compare", *files, "--out", tmp_path / "all.rrd").code == 1
     assert_all_drawn(viewer, tmp_path / "all.rrd", AT[kind])
+    assert len(links(viewer)) == len(files) - 1
+    viewer._client.open(links(viewer)[0])
 
 
 def test_every_view_of_a_diagnosis_draws_and_its_links_jump(

@@ -18,7 +18,10 @@ _LINK = re.compile(r'\(recording:/(/[^\s)]+) "at ([\d.-]+) s"\)')
 
 
 def link(text: str, entity: str, time: float) -> str:
-    """A link, in markdown, that goes to a time (s), to the nanosecond, and selects an entity."""
+    """A link, in markdown, that goes to a time (s), to the nanosecond, and selects an entity, or where its name is not
+    for links what it is part of."""
+    if not re.fullmatch(r"[\w/.-]+", entity):
+        entity = "/" + entity.split("/")[1]
     return f'[→ {text}](recording:/{entity} "at {time:.9f} s")'
 
 
