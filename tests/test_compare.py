@@ -329,6 +329,20 @@ def test_labels_are_compared_by_their_probabilities(cli: Cli, made: dict[str, Pa
     assert difference["by"] == pytest.approx(np.abs(a[0] - b[0]).max())
 
 
+def test_particles_are_compared_by_their_weighted_moments_at_each_stage(cli: Cli, tmp_path: Path) -> None:
+    """Other weights, and the same cloud before: they part where the readings are weighed."""
+    files = [tmp_path / f"{noise}.rrd" for noise in (0.8, 2)]
+    short = ["--set=particles=100", "--set=data.duration=1", "--seed=1"]
+    for file in files:
+        assert cli("run", "beacons-pf", *short, f"--set=range_noise={file.stem}", "--out", file).code == 0
+    found = answer(cli("compare", *files, "--out", tmp_path / "out.rrd", "--json"))["first_difference"]
+    assert (found["step"], found["stage"], found["quantity"]) == (0, "weigh", "mean")
+    a, b = map(viz_estim.load, files)
+    mean, other = (run.stages["weigh"].mean[0] for run in (a, b))
+    sigma = np.sqrt(np.diag(a.stages["weigh"].cov[0]))
+    assert found["by"] == pytest.approx(np.abs(a.space.minus(other, mean) / sigma).max())
+
+
 # The merged recording.
 
 

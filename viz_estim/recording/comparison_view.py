@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import groupby
 
+import numpy as np
 import rerun.blueprint as rrb
 
 from viz_estim.recording import links, schema
@@ -16,7 +17,7 @@ _Item = rrb.Container | rrb.View
 _FEW = 3  # runs up to which a plot has room for their legend
 _NAMES = {"attitude": "attitude", "world": "world [m]", "bars": "probabilities", "canvas": "mosaic [deg]"}
 _TABS = {
-    "difference": "Difference", "belief": "Belief", "error": "Errors", "state": "State, truth white", "sigma": "σ",
+    "difference": "Difference", "belief": "Belief", "error": "Errors", "state": "State", "sigma": "σ",
     "innovation": "Innovations", "nis": "NIS", "moved": "What moved it", "figure": "Figures",
 }  # fmt: skip
 
@@ -27,7 +28,8 @@ def build(runs: list[Compared], scenes: Scenes, plots: list[Plot], notes: str) -
     beneath: list[_Item] = []
     for tab in _TABS:
         if members := [plot for plot in plots if plot.tab == tab]:
-            beneath += _tabs(_TABS[tab], members, len(runs), named=bool(above))
+            white = ", truth white" if tab == "state" and any(np.isfinite(run.run.truth).any() for run in runs) else ""
+            beneath += _tabs(_TABS[tab] + white, members, len(runs), named=bool(above))
     lanes = [
         rrb.StateTimelineView(
             origin=f"{run.path}{schema.LANES}", name=f"{run.title}: stage, and each sensor's readings"
@@ -57,7 +59,7 @@ def _scenes(runs: list[Compared], scenes: Scenes) -> list[_Item]:
         wide = (4.2 if len(holders) <= 3 else 7.0) / across  # a view's width by its height in a window of 1.6
         views = [view(scene, [one], runs[0], scenes, f"{one.title}: {word}", wide) for one in holders]
         if scene == CANVAS and scenes.panorama:
-            views.append(flat(f"{runs[0].path}{PANORAMA}", None, scenes.sizes.get(PANORAMA), "True world [deg]"))
+            views.append(flat(f"{runs[0].path}{PANORAMA}", None, scenes.sizes.get((PANORAMA, 0)), "True world [deg]"))
             across = len(views) if len(views) <= 3 else -(-len(views) // 2)
         found.append(rrb.Grid(*views, grid_columns=across, name=word.capitalize()))
         if scene in (schema.WORLD, schema.ATTITUDE) and len(holders) > 1:
@@ -69,7 +71,8 @@ def _scenes(runs: list[Compared], scenes: Scenes) -> list[_Item]:
 def _tabs(title: str, plots: list[Plot], runs: int, *, named: bool) -> list[_Item]:
     """Plots in rows, those of one part of the state together; in as many tabs as keep them readable.
 
-    One legend a tab, in its first plot; of many runs where it has a row for itself, or where no scene above names them.
+    A legend where a plot has a run that none before it on the tab has; of many runs where that plot has a row for
+    itself, or where no scene above names them.
     """
     rows: list[tuple[str, list[Plot]]] = []
     for name, members in groupby(plots, key=lambda plot: plot.row):
@@ -84,12 +87,16 @@ def _tabs(title: str, plots: list[Plot], runs: int, *, named: bool) -> list[_Ite
     found: list[_Item] = []
     for i in range(0, len(rows), size):
         some = rows[i : i + size]
-        legend = runs <= _FEW or len(some[0][1]) == 1 or not named
         names = ", ".join(dict.fromkeys(name for name, _ in some))
-        lines = [
-            rrb.Horizontal(*(_plot(plot, legend=legend and plot is some[0][1][0]) for plot in members))
-            for _, members in some
-        ]
+        shown: set[int] = set()
+        lines = []
+        for _, row in some:
+            line = []
+            for plot in row:
+                new = not plot.runs <= shown
+                line.append(_plot(plot, legend=new and (runs <= _FEW or len(row) == 1 or not named)))
+                shown |= plot.runs
+            lines.append(rrb.Horizontal(*line))
         found.append(rrb.Vertical(*lines, name=f"{title}: {names}" if count > 1 else title))
     return found
 

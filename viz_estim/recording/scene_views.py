@@ -16,20 +16,20 @@ from viz_estim.recording.layout import flat3, is_position, place_of
 from viz_estim.recording.pictures import CANVAS, PANORAMA
 
 _PLAIN: dict[str, Any] = {"background": [13, 14, 16]}
-_NO_SCENES = {"stages", "steps", "events", "lanes", "plots", "notes", "__properties"}
+_NO_SCENES = {"stages", "steps", "events", "lanes", "plots", "notes", "findings", "__properties"}
 
 
 class Scenes:
     """What the recordings draw in space, learnt from their chunks: by scene (`/world`, `/sensors/accel`), which runs
     move something in it; truths: the scenes that have the first run's truth; standing: places (M, 3) in the world of
-    what stands still; sizes: a sphere's radius, or the height of an unrolled one."""
+    what stands still; sizes: by scene and run a sphere's radius, or the height of an unrolled one."""
 
     def __init__(self) -> None:
         self.runs: dict[str, list[int]] = {}
         self.truths: set[str] = set()
         self.panorama = False  # the true one
         self.standing: list[Array] = []
-        self.sizes: dict[str, float] = {}
+        self.sizes: dict[tuple[str, int], float] = {}
 
     def learn(self, run: Compared, chunk: Chunk) -> None:
         scene = scene_of(chunk.entity_path)
@@ -42,9 +42,9 @@ class Scenes:
             self.truths.add(parts[0])
         self.panorama |= run.place == 0 and scene == PANORAMA
         if chunk.is_static:
-            self._learn_static(scene, chunk)
+            self._learn_static(scene, run.place, chunk)
 
-    def _learn_static(self, scene: str, chunk: Chunk) -> None:
+    def _learn_static(self, scene: str, place: int, chunk: Chunk) -> None:
         batch = chunk.to_record_batch()
         for name, n in (("Points3D:positions", 3), ("LineStrips3D:strips", 3), ("Ellipsoids3D:half_sizes", 3),
                         ("LineStrips2D:strips", 2)):  # fmt: skip
@@ -56,7 +56,8 @@ class Scenes:
                 if scene == schema.WORLD:
                     self.standing.append(points)
                 elif not name.startswith("Points") and len(points):
-                    self.sizes[scene] = max(self.sizes.get(scene, 0.0), float(points[:, 1].max()))
+                    size = float(points[:, 1].max())
+                    self.sizes[scene, place] = max(self.sizes.get((scene, place), 0.0), size)
 
 
 def scene_of(entity: str) -> str | None:
@@ -79,7 +80,7 @@ def view(scene: str, holders: list[Compared], first: Compared, scenes: Scenes, n
         contents.append(f"+ {first.path}{scene}/truth/**")
     origin = f"{holders[0].path}{scene}"
     if scene == CANVAS:
-        return flat(origin, contents, scenes.sizes.get(scene), name)
+        return flat(origin, contents, scenes.sizes.get((scene, holders[0].place)), name)
     trail: Any = {f"{one.path}{scene}/estimate/trail": [rrb.VisibleTimeRanges(_since_start())] for one in holders}
     return rrb.Spatial3DView(
         origin=origin, contents=contents, name=name, eye_controls=_eye(scene, holders, first, scenes, wide),
@@ -105,7 +106,7 @@ def _since_start() -> list[rrb.VisibleTimeRange]:
 
 
 def _eye(scene: str, holders: list[Compared], first: Compared, scenes: Scenes, wide: float) -> rrb.EyeControls3D:
-    """The same for all runs: the first's places decide."""
+    """The same for all runs: the first's places decide; round a sphere as far away as it is large."""
     if scene == schema.BARS:
         count = max(len(one.run.labels) for one in holders)
         middle = 0.5 * schema.BAR * (count - 1)
@@ -113,7 +114,7 @@ def _eye(scene: str, holders: list[Compared], first: Compared, scenes: Scenes, w
             position=[middle, 0.45, 1.3 + 0.35 * count], look_target=[middle, 0.45, 0], eye_up=[0, 1, 0], kind="Orbital"
         )
     if scene != schema.WORLD:
-        size = scenes.sizes.get(scene, 1.0)
+        size = scenes.sizes.get((scene, holders[0].place), 1.0)
         place = [1.6 * size, -1.9 * size, 1.1 * size]
         return rrb.EyeControls3D(position=place, look_target=[0, 0, 0], eye_up=[0, 0, 1], kind="Orbital")
     places = _places(first) if _position(first) else _places(holders[0])

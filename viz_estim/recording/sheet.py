@@ -21,13 +21,14 @@ ONCE: dict[str, schema.Colour] = {"-reading": _READING, "-truth": schema.TRUTH}
 
 
 class Plot(NamedTuple):
-    """A plot that was drawn: where, on which tab, in which row of it, under which title."""
+    """A plot that was drawn: where, on which tab, in which row of it, under which title; runs: whose lines it has."""
 
     path: str
     tab: str
     row: str
     title: str
-    top: float | None = None  # the axis from 0 to here, where it is known
+    top: float | None  # the axis from 0 to here, where it is known
+    runs: set[int]
 
 
 class Sheet:
@@ -53,7 +54,7 @@ class Sheet:
             count += 1
             path = schema.plot(tab, f"{key}-{count}")
         new = path not in self.plots
-        self.plots.setdefault(path, Plot(path, tab, row, title, top))
+        self.plots.setdefault(path, Plot(path, tab, row, title, top, set()))
         return path, new
 
     def line(
@@ -63,6 +64,7 @@ class Sheet:
         """A run's line in the plot of a quantity, if there is any value."""
         if np.isfinite(values).any():
             path, _ = self.plot(tab, key, row, title, top=top)
+            self.plots[path].runs.add(one.place)
             self._lines.broken(f"{path}/{one.part}", at, "", (one.name, one.colour, values))
 
     def once(self, tab: str, key: str, what: str, name: str, at: Times, values: Array, row: str, title: str) -> None:
