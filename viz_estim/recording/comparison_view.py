@@ -74,30 +74,28 @@ def _tabs(title: str, plots: list[Plot], runs: int, *, named: bool) -> list[_Ite
     A legend where a plot has a run that none before it on the tab has; of many runs where that plot has a row for
     itself, or where no scene above names them.
     """
-    rows: list[tuple[str, list[Plot]]] = []
-    for name, members in groupby(plots, key=lambda plot: plot.row):
-        views = list(members)
-        if rows and len(rows[-1][1]) + len(views) <= 4 and len(views) < 3:
-            rows[-1] = (f"{rows[-1][0]}, {name}", rows[-1][1] + views)
-            continue
-        across = 3 if len(views) % 3 == 0 else 4
-        rows += [(name, views[i : i + across]) for i in range(0, len(views), across)]
+    rows: list[list[Plot]] = []
+    for _, members in groupby(plots, key=lambda plot: plot.row):
+        group = list(members)
+        if rows and len(rows[-1]) + len(group) <= 4 and len(group) < 3:
+            rows[-1] += group
+        else:
+            across = 3 if len(group) % 3 == 0 else 4
+            rows += [group[i : i + across] for i in range(0, len(group), across)]
     count = -(-len(rows) // (3 if runs <= _FEW else 2))
     size = -(-len(rows) // count)
     found: list[_Item] = []
     for i in range(0, len(rows), size):
-        some = rows[i : i + size]
-        names = ", ".join(dict.fromkeys(name for name, _ in some))
         shown: set[int] = set()
         lines = []
-        for _, row in some:
+        for row in rows[i : i + size]:
             line = []
             for plot in row:
                 new = not plot.runs <= shown
                 line.append(_plot(plot, legend=new and (runs <= _FEW or len(row) == 1 or not named)))
                 shown |= plot.runs
             lines.append(rrb.Horizontal(*line))
-        found.append(rrb.Vertical(*lines, name=f"{title}: {names}" if count > 1 else title))
+        found.append(rrb.Vertical(*lines, name=f"{title} {len(found) + 1}" if found else title))
     return found
 
 

@@ -142,7 +142,7 @@ def _tabs(title: str, groups: list[_Plots]) -> list[_Item]:
     size = -(-len(rows) // count)
     parts = [rows[i : i + size] for i in range(0, len(rows), size)]
     return [
-        rrb.Vertical(*(rrb.Horizontal(*row) for row in part), name=f"{title} {i}" if count > 1 else title)
+        rrb.Vertical(*(rrb.Horizontal(*row) for row in part), name=f"{title} {i}" if i > 1 else title)
         for i, part in enumerate(parts, 1)
     ]
 
