@@ -17,6 +17,8 @@ from viz_estim.recording.viewer import Viewer, ViewerError
 
 # Half a second of work: still, then turning, then the gyro freezes while it turns.
 SHORT = ["data.duration=6", "data.still=1", "data.freeze=1.5"]
+# The same as short as the story can be.
+SHORTEST = ["data.duration=3.5", "data.still=0.5", "data.freeze=1.5"]
 
 
 class Result(NamedTuple):

@@ -1,7 +1,9 @@
 """Runs side by side: where they part first, their figures, and the recording that holds them all."""
 
 import dataclasses
+import functools
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,10 +11,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from conftest import SHORT, Cli, Result
+from conftest import SHORTEST, Cli, Result
 from rerun.chunk import RrdReader
 
 import viz_estim
+from viz_estim.comparison_table import Row, text
 from viz_estim.core import quaternions
 from viz_estim.core.alignment import on_stamps, paired
 from viz_estim.core.beliefs import Gaussian
@@ -20,6 +23,7 @@ from viz_estim.core.run import Scenario, Step, Tick, run
 from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product
 from viz_estim.core.stages import Stage
 from viz_estim.differences import first_difference, other_data
+from viz_estim.recording import overlaid_stages
 from viz_estim.recording.compared import Clock, Compared
 from viz_estim.recording.merged import _recoloured
 from viz_estim.recording.reader import Run, load
@@ -43,7 +47,7 @@ def answer(done: Result) -> dict[str, Any]:
 def made(cli: Cli, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Short runs of several systems by name."""
     folder = tmp_path_factory.mktemp("made")
-    short = [f"--set={setting}" for setting in SHORT]
+    short = [f"--set={setting}" for setting in SHORTEST]
     asked = {
         "ukf": ["imu-ukf", *short, "--seed", "3"],
         "again": ["imu-ukf", *short, "--seed", "3"],
@@ -71,11 +75,17 @@ def record(path: Path, steps: list[Step], made: Scenario, **facts: Any) -> Path:
     return path
 
 
+@functools.cache
+def steps_of(name: str) -> tuple[Scenario, list[Step]]:
+    made = plan(name, data=None, calibration=None, settings=SHORTEST, seed=3).build()
+    made = dataclasses.replace(made, ticks=made.ticks[:200])
+    return made, list(run(made, 3))
+
+
 def thinned(name: str, folder: Path, keep: slice) -> Path:
     """The scenario's own steps, every other of them say, through the recorder: a run at another rate."""
-    made = plan(name, data=None, calibration=None, settings=SHORT, seed=3).build()
-    made = dataclasses.replace(made, ticks=made.ticks[:200])
-    return record(folder / f"{name}-{keep.start}-{keep.stop}-{keep.step}.rrd", list(run(made, 3))[keep], made)
+    made, steps = steps_of(name)
+    return record(folder / f"{name}-{keep.start}-{keep.stop}-{keep.step}.rrd", steps[keep], made)
 
 
 # Alignment: the clock.
@@ -126,9 +136,9 @@ def test_the_same_seed_twice_is_the_same(cli: Cli, made: dict[str, Path], tmp_pa
         assert (found["same"], found["first_difference"], found["reason"]) == (True, None, None)
         assert [one["name"] for one in found["runs"]] == ["ukf", "again"]
         assert found["recording"] == str(out)
-    text = cli("compare", made["ukf"], made["again"], "--out", tmp_path / "out.rrd").out
-    assert text.splitlines()[-1] == f"viz-estim open {tmp_path / 'out.rrd'}"
-    assert "again is the same as ukf" in text
+    told = cli("compare", made["ukf"], made["again"], "--out", tmp_path / "out.rrd").out
+    assert told.splitlines()[-1] == f"viz-estim open {tmp_path / 'out.rrd'}"
+    assert "again is the same as ukf" in told
 
 
 def test_the_figures_are_those_of_each_run(cli: Cli, made: dict[str, Path], tmp_path: Path) -> None:
@@ -136,11 +146,11 @@ def test_the_figures_are_those_of_each_run(cli: Cli, made: dict[str, Path], tmp_
     for one in found["runs"]:
         shown = json.loads(cli("show", one["file"], "--json").out)
         assert {k: one[k] for k in ("metrics", "nis", "nees")} == {k: shown[k] for k in ("metrics", "nis", "nees")}
-    text = cli("compare", made["ukf"], made["loose"], "--out", tmp_path / "out.rrd").out
-    assert "gyro_noise" in text
-    assert "accel_noise" not in text
-    assert "NEES" in text
-    assert "to ukf: attitude_rmse_deg" in text
+    told = cli("compare", made["ukf"], made["loose"], "--out", tmp_path / "out.rrd").out
+    assert "gyro_noise" in told
+    assert "accel_noise" not in told
+    assert "NEES" in told
+    assert "difference to ukf:\n  attitude_rmse_deg" in told
 
 
 def test_a_parameter_that_acts_after_the_freeze_shows_there_first(
@@ -181,9 +191,9 @@ def naive(a: Run, b: Run, tol: float) -> tuple[int, str, str, float] | None:
 def test_tol_bounds_the_ratio(cli: Cli, made: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "out.rrd"
     steps = []
+    a, b = (load(made[name], points=False) for name in ("ukf", "loose"))
     for tol in (0, 1e-9, 1e-3, 0.1, 1.0):
         found = answer(cli("compare", made["ukf"], made["loose"], "--out", out, "--tol", tol, "--json"))
-        a, b = (viz_estim.load(made[name]) for name in ("ukf", "loose"))
         expected = naive(a, b, tol)
         assert expected is not None
         difference = found["first_difference"]
@@ -319,6 +329,20 @@ def test_labels_are_compared_by_their_probabilities(cli: Cli, made: dict[str, Pa
     assert difference["by"] == pytest.approx(np.abs(a[0] - b[0]).max())
 
 
+def test_particles_are_compared_by_their_weighted_moments_at_each_stage(cli: Cli, tmp_path: Path) -> None:
+    """Other weights, and the same cloud before: they part where the readings are weighed."""
+    files = [tmp_path / f"{noise}.rrd" for noise in (0.8, 2)]
+    short = ["--set=particles=100", "--set=data.duration=1", "--seed=1"]
+    for file in files:
+        assert cli("run", "beacons-pf", *short, f"--set=range_noise={file.stem}", "--out", file).code == 0
+    found = answer(cli("compare", *files, "--out", tmp_path / "out.rrd", "--json"))["first_difference"]
+    assert (found["step"], found["stage"], found["quantity"]) == (0, "weigh", "mean")
+    a, b = map(viz_estim.load, files)
+    mean, other = (run.stages["weigh"].mean[0] for run in (a, b))
+    sigma = np.sqrt(np.diag(a.stages["weigh"].cov[0]))
+    assert found["by"] == pytest.approx(np.abs(a.space.minus(other, mean) / sigma).max())
+
+
 # The merged recording.
 
 
@@ -348,6 +372,88 @@ def test_each_run_keeps_all_but_its_plots_and_truth_is_there_once(
     assert {entity for entity in truths if entity.startswith("/plots/")} == {
         f"/plots/state/attitude.{c}/-truth" for c in ("qw", "qx", "qy", "qz")
     }
+
+
+def plotted(path: Path, group: str) -> dict[str, list[tuple[int, float]]]:
+    """By entity under a group of plots, steps and values."""
+    found: dict[str, list[tuple[int, float]]] = {}
+    for chunk in RrdReader(path).stream().filter(content=[f"/plots/{group}/**"]):
+        if not chunk.is_static:
+            batch = chunk.to_record_batch()
+            values = batch.column("Measurements:values").to_pylist()
+            rows = zip(batch.column("step").to_pylist(), values, strict=True)
+            found.setdefault(str(chunk.entity_path), []).extend((step, value[0]) for step, value in rows if value)
+    return found
+
+
+def test_what_moved_each_estimate_is_drawn_by_direction_all_readings_together(
+    cli: Cli, made: dict[str, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out.rrd"
+    cli("compare", made["ukf"], made["loose"], made["gyro"], "--out", out)
+    lines = plotted(out, "moved")
+    assert {path.split("/")[-1] for path in lines} == {"ukf", "loose"}  # nothing corrects the other
+    for name in ("ukf", "loose"):
+        a = viz_estim.load(made[name])
+        for axis, (step, value) in (
+            (i, lines[f"/plots/moved/{path}/{name}"][40]) for i, path in enumerate(a.space.axes)
+        ):
+            ((update, row),) = [(table, row) for table, row in a.at(step) if table.name == "update"]
+            before, at = a.before(update, row) or pytest.fail("no stage before it")
+            delta = update.values["gain"][row] @ update.values["innovation.residual"][row]
+            assert value == pytest.approx(delta[axis] / np.sqrt(before.cov[at][axis, axis]))
+
+
+def test_what_several_updates_of_a_step_moved_is_their_sum(tmp_path: Path) -> None:
+    with viz_estim.record(tmp_path / "two.rrd", space={"x": "m", "y": "m"}) as rec:
+        for k in range(4):
+            rec.stage("predict", mean=[0, 0], cov=np.diag([4.0, 1.0]))
+            for name, K in (("gps", [[0.5], [0.25]]), ("lidar", [[0.25], [0.0]])):
+                if not (k == 2 and name == "lidar"):
+                    rec.stage(name, mean=[0, 0], cov=np.eye(2), residual=[k], residual_cov=[[1.0]], gain=K)
+            rec.step(time=0.1 * k)
+    place, step, total = overlaid_stages.moved(load(tmp_path / "two.rrd"))
+    assert step.tolist() == [0, 1, 2, 3]
+    assert place.tolist() == [2, 5, 7, 10]
+    np.testing.assert_allclose(total[:, 0], [0, 0.25 + 0.25, 0.5, 0.75 + 0.75])
+    np.testing.assert_allclose(total[:, 1], [0, 0.25, 0.5, 0.75])
+
+
+def test_an_error_has_its_length_and_readings_of_the_state_lie_beneath_it(
+    cli: Cli, made: dict[str, Path], tmp_path: Path
+) -> None:
+    out = tmp_path / "out.rrd"
+    cli("compare", made["ukf"], made["loose"], "--out", out)
+    a = viz_estim.load(made["ukf"])
+    turn = np.degrees(np.linalg.norm(SO3().minus(a.mean[:, :4], a.truth[:, :4]), axis=1))
+    step, value = plotted(out, "error")["/plots/error/attitude.length/ukf"][50]
+    assert value == pytest.approx(turn[step])
+    step, value = plotted(out, "state")["/plots/state/rate.y/-reading"][50]
+    assert value == a.inputs["z.gyro"][step, 1]
+
+
+def test_a_nis_of_other_degrees_of_freedom_is_another_quantity(cli: Cli, made: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "out.rrd"
+    told = cli("compare", made["ukf"], made["alone"], "--out", out).out
+    assert re.search(r"NIS accel \(3 expected\) +[\d.]+ \w+ +–", told)
+    assert re.search(r"NIS accel \(2 expected\) +– +[\d.]+ \w+\n", told)
+    assert {"/plots/nis/accel/ukf", "/plots/nis/accel-2/alone"} <= set(entities(out))
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 400])
+def test_the_table_is_as_wide_as_the_terminal(width: int) -> None:
+    names = [f"a rather long name of run {i}" for i in range(6)]
+    table = [
+        Row("metric_of_unit", [f"{i}" for i in range(6)]),
+        Row("difference:", []),
+        Row("  other", ["–"] * 5 + ["7"]),
+    ]
+    lines = text(names, table, width)
+    assert max(map(len, lines)) <= width
+    words = " ".join(lines)
+    assert all(words.count(name) == 1 for name in names)
+    assert words.count("  other") == 1
+    assert len(lines) == (4 if width == 400 else 4 * lines.count("") + 3 + 1)
 
 
 def test_a_difference_plot_is_the_turn_between_the_two_on_the_first_run_s_stamps(tmp_path: Path, cli: Cli) -> None:

@@ -1,65 +1,111 @@
-"""What a real headless viewer shows of a comparison: every view draws, and none is empty, for two to six runs."""
+"""What a real headless viewer shows of comparisons, for two to six runs, and of a diagnosis: every view draws, none is
+empty, and the panels' links jump."""
 
-import copy
+import json
+import re
+import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
-from conftest import SHORT, Cli
-from test_pictures import emptiness, in_front, picture
+from conftest import SHORTEST, Cli
+from test_pictures import emptiness, picture
 
+import viz_estim
 from viz_estim.recording.viewer import Viewer
 
 pytestmark = pytest.mark.draws
 
-_IMU = ["imu-ukf-gyro", *(f"--set={setting}" for setting in SHORT), "--seed", "3"]
-_DRIVE = ["diffdrive-ekf", "--set=data.duration=4", "--seed", "1"]
-_BAYES = ["underwater-bayes", "--set=data.steps=60", "--seed", "1"]
-_CLOUD = ["beacons-pf", "--set=particles=200", "--seed", "1"]
+_IMU = ["imu-ukf-gyro", *(f"--set={setting}" for setting in SHORTEST), "--seed", "3"]
+_DRIVE = ["diffdrive-ekf", "--set=data.duration=3", "--seed", "1"]
+_BAYES = ["underwater-bayes", "--set=data.steps=40", "--seed", "1"]
+_CLOUD = ["beacons-pf", "--set=particles=200", "--set=data.duration=3", "--seed", "1"]
 KINDS: dict[str, list[list[str]]] = {
     "attitudes": [_IMU, ["imu-gyro", *_IMU[1:]]],
     "six robots": [[*_DRIVE, f"--set=gps_noise={noise}"] for noise in (0.2, 0.5, 1, 2, 4, 8)],
     "three bars": [_BAYES, [*_BAYES, "--set=stay=0.7"], [*_BAYES, "--set=hazard=0.6"]],
     "clouds": [_CLOUD, [*_CLOUD, "--set=range_noise=2"]],
 }
-AT = {"attitudes": 3.5, "six robots": 2.0, "three bars": 30.0, "clouds": 2.0}
+AT = {"attitudes": 2.5, "six robots": 2.0, "three bars": 30.0, "clouds": 2.0}
+SIZE, HEAD, FOOT = (1100, 800), 37, 28  # a window, and what the viewer takes of it above and below the views
 
 
-@pytest.fixture(scope="module", params=KINDS)
-def compared(request: pytest.FixtureRequest, cli: Cli, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
-    folder = tmp_path_factory.mktemp("compared")
-    files = [folder / f"{'abcdef'[i]}.rrd" for i in range(len(KINDS[request.param]))]
-    for arguments, file in zip(KINDS[request.param], files, strict=True):
+@pytest.fixture(scope="module")
+def viewer() -> Iterator[Viewer]:
+    with Viewer.start(headless=True, size=SIZE) as started:
+        yield started
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_view_of_a_comparison_draws_and_none_is_empty(
+    kind: str, viewer: Viewer, cli: Cli, tmp_path: Path
+) -> None:
+    files = [tmp_path / f"{'abcdef'[i]} {kind}.rrd" for i in range(len(KINDS[kind]))]
+    for arguments, file in zip(KINDS[kind], files, strict=True):
         assert cli("run", *arguments, "--out", file).code == 0
-    assert cli("compare", *files, "--out", folder / "all.rrd").code == 1
-    return request.param, folder / "all.rrd"
+    assert cli("compare", *files, "--out", tmp_path / "all.rrd").code == 1
+    assert_all_drawn(viewer, tmp_path / "all.rrd", AT[kind])
+    assert len(links(viewer)) == len(files) - 1
+    viewer._client.open(links(viewer)[0])
 
 
-def layouts(blueprint: dict[str, Any]) -> list[dict[str, Any]]:
-    """The view's own blueprint, and the same with other tabs in front, so that each is in front in one of them."""
-    containers = {path: fields.get("ContainerBlueprint", {}) for path, fields in blueprint.items()}
-    tabs = {path: c["contents"] for path, c in containers.items() if c.get("container_kind") == "Tabs"}
-    variants = []
-    for number in range(max(map(len, tabs.values()))):
-        variants.append(copy.deepcopy(blueprint))
-        for path, contents in tabs.items():
-            variants[-1][path]["ContainerBlueprint"]["active_tab"] = contents[min(number, len(contents) - 1)]
-    return variants
+def test_every_view_of_a_diagnosis_draws_and_its_links_jump(
+    viewer: Viewer, cli: Cli, recording: Path, tmp_path: Path
+) -> None:
+    findings = json.loads(cli("diagnose", recording, "--out", tmp_path / "marked.rrd", "--json").out)["findings"]
+    assert_all_drawn(viewer, tmp_path / "marked.rrd", 3.0)
+    run = viz_estim.load(recording)
+    for url, finding in list(zip(links(viewer), findings, strict=True))[:3]:
+        assert url.startswith("rerun+http://127.0.0.1:")
+        viewer._client.open(url)  # what the viewer does at a click
+        expected = round(1e9 * run.time[run.row(step=finding["steps"][0])])
+        deadline = time.monotonic() + 5
+        while (now := cursor(viewer)) != ("time", expected) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert now == ("time", expected)
 
 
-def test_every_view_of_a_comparison_draws_and_none_is_empty(compared: tuple[str, Path], tmp_path: Path) -> None:
-    kind, path = compared
-    with Viewer.start(headless=True, size=(1100, 750)) as viewer:
-        viewer.open(path)
-        shown: set[str] = set()
-        for layout in layouts(viewer._client.get_blueprint().blueprint):
-            viewer._client.set_blueprint(layout, of="recording")
-            viewer.seek("time", AT[kind])
-            assert viewer.snapshot(tmp_path / "settled.png")
-            assert viewer.problems() == []
-            front = in_front(layout)
-            views = [v for v in viewer._client.get_state().views if v.view_id in front and v.view_id not in shown]
-            lacks = {view.name: emptiness(view.view_class, picture(viewer, view.view_id)) for view in views}
-            assert not any(lacks.values()), {name: lack for name, lack in lacks.items() if lack}
-            shown |= {view.view_id for view in views}
-        assert shown == {view.view_id for view in viewer._client.get_state().views}
+def links(viewer: Viewer) -> list[str]:
+    """The addresses in the text panels of the recording in front."""
+    texts = [fields.get("TextDocument", {}) for fields in viewer._client.get_blueprint().blueprint.values()]
+    return [url for text in texts if text for url in re.findall(r"\]\(([^)]*)\)", text["text"])]
+
+
+def cursor(viewer: Viewer) -> tuple[str, int]:
+    state = viewer._client.get_state()
+    (front,) = [recording for recording in state.recordings if recording.store_id == state.active_recording]
+    return front.current_timeline, front.current_time
+
+
+def assert_all_drawn(viewer: Viewer, path: Path, at: float) -> None:
+    """At a time, all views of all tabs draw without a complaint, and show something."""
+    viewer.open(path)
+    cells = side_by_side(viewer)
+    viewer.seek("time", at)
+    assert viewer.snapshot(path.with_suffix(".png"), settle=30)
+    assert viewer.problems() == []
+    assert len(viewer.views()) == len(cells)
+    pixels = picture(viewer)
+    lacks = {name: emptiness(kind, pixels[rows, columns]) for name, kind, rows, columns in cells}
+    assert not any(lacks.values()), {name: lack for name, lack in lacks.items() if lack}
+
+
+def side_by_side(viewer: Viewer) -> list[tuple[str, str, slice, slice]]:
+    """Puts all views of all tabs into one grid; each one's name and class, and the pixels that it has for itself."""
+    blueprint = viewer._client.get_blueprint().blueprint
+    views = [path.lstrip("/") for path, fields in blueprint.items() if "ViewBlueprint" in fields]
+    across = int(np.ceil(np.sqrt(len(views))))
+    down = -(-len(views) // across)
+    root = blueprint["/viewport"]["ViewportBlueprint"]["root_container"]
+    kept = {path: fields for path, fields in blueprint.items() if not path.startswith("/container/")}
+    grid = {"container_kind": "Grid", "contents": views, "grid_columns": across}
+    viewer._client.set_blueprint(kept | {f"/container/{root}": {"ContainerBlueprint": grid}}, of="recording")
+    width, height = SIZE[0] / across, (SIZE[1] - HEAD - FOOT) / down
+    cells = []
+    for i, path in enumerate(views):
+        view = blueprint[f"/{path}"]["ViewBlueprint"]
+        x, y = i % across * width, HEAD + i // across * height
+        rows, columns = slice(int(y) + 28, int(y + height) - 2), slice(int(x) + 2, int(x + width) - 2)
+        cells.append((view["display_name"], view["class_identifier"], rows, columns))
+    return cells

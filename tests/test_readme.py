@@ -2,6 +2,7 @@
 
 import io
 import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,21 @@ def test_its_filter_runs_is_recorded_and_stepped_through(
     monkeypatch.setattr("sys.stdin", io.StringIO("step 3\nwhere\nquit\n"))
     assert main(["debug", "walk.py:walk", "--no-viewer"]) == 0
     assert "step 3  update" in capsys.readouterr().out
+
+
+def test_its_comparison_says_what_it_quotes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    section = README.split("## Two runs side by side")[1].split("\n## ")[0]
+    commands, quoted = re.findall(r"```(?:sh)?\n(.*?)```", section, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+    codes = [main(shlex.split(line, comments=True)[1:]) for line in commands.splitlines()]
+    assert codes == [0, 0, 1]
+    told = capsys.readouterr().out.splitlines()
+    assert [line for line in quoted.splitlines() if line != "…"] == [
+        line for line in told if line in quoted.split("\n")
+    ]
 
 
 SAMPLES = sorted((ROOT / "recordings").glob("*-sample.rrd"))

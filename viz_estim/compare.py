@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from viz_estim.core.alignment import on_stamps
-from viz_estim.core.consistency import metrics
-from viz_estim.core.spaces import Product
+from viz_estim import comparison_table
 from viz_estim.differences import Difference, first_difference, other_data
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable
-from viz_estim.recording import merged
-from viz_estim.recording.compared import COLOURS, Compared, light, shared_parts
+from viz_estim.recording import merged, schema
+from viz_estim.recording.compared import COLOURS, Compared, light
+from viz_estim.recording.links import link
 from viz_estim.recording.reader import Run, load
-
-Table = list[tuple[str, list[str]]]
 
 
 def compare(paths: list[Path], out: Path | None, tol: float) -> tuple[dict[str, Any], str]:
@@ -32,7 +28,7 @@ def compare(paths: list[Path], out: Path | None, tol: float) -> tuple[dict[str, 
     path = _target(paths, out, names)
     runs, figures = [], []
     for file in paths:
-        run = load(file, points=False)
+        run = _loaded(file)
         figures.append(run.summary())
         runs.append(light(run))
     reasons = [None, *(other_data(runs[0], run) for run in runs[1:])]
@@ -55,10 +51,19 @@ def compare(paths: list[Path], out: Path | None, tol: float) -> tuple[dict[str, 
         "same": earliest is None and reason is None,
         "reason": reason,
     }  # fmt: skip
-    table = _table(compared, figures)
+    table = comparison_table.rows(compared, figures)
     verdicts = _verdicts(compared, found, reasons, tol)
-    merged.write(path, compared, result, _markdown(names, table, verdicts))
-    return result, "\n".join([*_aligned(names, table), *verdicts, f"viz-estim open {path}"])
+    listed = [f"- {_linked(line, compared[0], one)}" for line, one in zip(verdicts, found[1:], strict=True)]
+    notes = "\n".join([*listed, "", comparison_table.markdown(names, table)])
+    merged.write(path, compared, result, notes)
+    lines = comparison_table.text(names, table, shutil.get_terminal_size((120, 24)).columns)
+    return result, "\n".join([*lines, *verdicts, f"viz-estim open {path}"])
+
+
+def _loaded(file: Path) -> Run:
+    """A run without its points, which are most of its bytes; of particles with them, for the stages' means."""
+    run = load(file, points=False)
+    return load(file) if run.properties.get("particles") else run
 
 
 def _names(paths: list[Path]) -> list[str]:
@@ -103,13 +108,23 @@ def _verdicts(
     return lines
 
 
+def _linked(verdict: str, first: Compared, one: Difference | None) -> str:
+    """The line with its step as a link there."""
+    if one is None:
+        return verdict
+    step, run = f"step {one.step}", first.run
+    entity = first.path + (schema.stage(one.stage) if one.stage in run.stages else schema.STEPS)
+    return verdict.replace(f"{step} ", link(step, entity, float(run.time[run.row(step=one.step)])) + " ", 1)
+
+
 def _worded(one: Difference) -> str:
     if one.quantity == "stage":
         return "one of the two has no such stage"
+    word = "covariance" if one.quantity == "cov" else one.quantity
     if one.by is None:
-        return f"the {one.quantity} is a number in one of the two alone"
+        return f"the {word} is a number in one of the two alone"
     unit = {"mean": " σ", "residual": " σ of S", "cov": " of its norm"}.get(one.quantity, "")
-    return f"the {one.quantity}, by {one.by:.3g}{unit}"
+    return f"the {word}, by {one.by:.3g}{unit}"
 
 
 def _overlap(a: Run, b: Run) -> str:
@@ -117,76 +132,3 @@ def _overlap(a: Run, b: Run) -> str:
     if len(a.step) == len(b.step):
         return ""
     return f" where both have steps ({len(a.step)} and {len(b.step)})"
-
-
-def _table(runs: list[Compared], figures: list[dict[str, Any]]) -> Table:
-    """Rows of a name and a cell a run: what was set differently, metrics, NIS, NEES, and how far from the first."""
-    rows: Table = [("colour", [one.hue for one in runs]), ("steps", [_steps(one.run) for one in runs])]
-    facts = [
-        {k: one.run.properties.get(k) for k in ("scenario", "seed", "calibration")}
-        | one.run.properties.get("params", {})
-        for one in runs
-    ]
-    for name in dict.fromkeys(key for one in facts for key in one):
-        values = [one.get(name, "–") for one in facts]
-        if any(value != values[0] for value in values):
-            rows.append((name, [_short(value) for value in values]))
-    for name in dict.fromkeys(key for one in figures for key in one["metrics"]):
-        rows.append((name, [_short(one["metrics"].get(name, "–")) for one in figures]))
-    for sensor in dict.fromkeys(key for one in figures for key in one["nis"]):
-        dofs = [one["nis"][sensor]["dof"] for one in figures if sensor in one["nis"]]
-        rows.append((f"NIS {sensor} (expected {dofs[0]})", [_nis(one["nis"].get(sensor)) for one in figures]))
-    if any(one["nees"] for one in figures):
-        rows.append(("NEES", [_nees(one["nees"]) for one in figures]))
-    apart = [_apart(runs[0], one) for one in runs]
-    for name in dict.fromkeys(key for one in apart for key in one):
-        rows.append((f"to {runs[0].name}: {name}", [_short(one.get(name, "–")) for one in apart]))
-    return rows
-
-
-def _steps(run: Run) -> str:
-    ended = "" if run.complete and run.error is None else ", failed" if run.error else ", cut off"
-    return f"{len(run.step)}{ended}"
-
-
-def _nis(one: dict[str, Any] | None) -> str:
-    if one is None:
-        return "–"
-    word = "inside" if one["low"] <= one["mean"] <= one["high"] else "above" if one["mean"] > one["high"] else "below"
-    return f"{one['mean']:.3g} ({word} {one['low']:.3g} to {one['high']:.3g})"
-
-
-def _nees(one: dict[str, Any] | None) -> str:
-    return f"{one['mean']:.3g} (expected {one['dof']}; {one['inside']:.0%} inside)" if one else "–"
-
-
-def _apart(first: Compared, other: Compared) -> dict[str, float]:
-    """The metrics of a run with the first run in the truth's place, on its stamps, by the parts that both have."""
-    names = shared_parts(first, other)
-    if other.place == 0 or not names:
-        return {}
-    a, b = first.run, other.run
-    space = Product(**{name: first.space.parts[name] for name in names})
-    mine = np.concatenate([a.mean[:, first.space.at[name]] for name in names], axis=1)
-    parts = [on_stamps(space.parts[k], b.time, b.mean[:, other.space.at[k]], a.time) for k in names]
-    return metrics(space, np.concatenate(parts, axis=1), mine)
-
-
-def _aligned(names: list[str], table: Table) -> list[str]:
-    rows = [("", names), *table]
-    wide = max(len(name) for name, _ in rows)
-    widths = [max(len(cells[i]) for _, cells in rows) for i in range(len(names))]
-    return [
-        f"{name:{wide}}" + "".join(f"  {cell:{width}}" for cell, width in zip(cells, widths, strict=True)).rstrip()
-        for name, cells in rows
-    ]
-
-
-def _markdown(names: list[str], table: Table, verdicts: list[str]) -> str:
-    rows = [["", *names], ["---"] * (len(names) + 1), *([name, *cells] for name, cells in table)]
-    lines = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
-    return "\n".join([*(f"- {line}" for line in verdicts), "", *lines])
-
-
-def _short(value: Any) -> str:
-    return f"{value:.5g}" if isinstance(value, (float, np.floating)) else str(value)

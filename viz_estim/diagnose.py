@@ -22,6 +22,7 @@ from viz_estim.diagnosis import (
 from viz_estim.diagnosis.evidence import Case, case
 from viz_estim.diagnosis.finding import CODES, Finding
 from viz_estim.recording import schema
+from viz_estim.recording.links import link
 from viz_estim.recording.marks import Mark
 from viz_estim.recording.reader import Run
 
@@ -122,18 +123,16 @@ def marks_of(findings: list[Finding]) -> list[Mark]:
 
 
 def markdown(run: Run, findings: list[Finding]) -> str:
-    """The findings as the text panel shows them; each title selects the finding's lane."""
+    """The findings as the text panel shows them; each one's steps are a link there."""
     if not findings:
         return "**Healthy:** nothing found."
     pieces = []
     for i, (finding, mark) in enumerate(zip(findings, marks_of(findings), strict=True), 1):
         first, last = finding.steps
         begin, end = (float(run.time[run.row(step=step)]) for step in finding.steps)
-        link = f"recording:/{schema.lane(mark.name)}"
+        when = link(f"steps {first}–{last}, {begin:.2f}–{end:.2f} s", schema.lane(mark.name), begin)
         pieces.append(
-            f"**[{_title(i, finding)}]({link})** ({finding.severity}), steps {first}–{last}, "
-            f"{begin:.2f}–{end:.2f} s\n\n"
-            f"{finding.cause}.\n\n*Try:* {finding.remedy}."
+            f"**{_title(i, finding)}** ({finding.severity}), {when}\n\n{finding.cause}.\n\n*Try:* {finding.remedy}."
         )
     return "\n\n---\n\n".join(pieces)
 

@@ -86,6 +86,14 @@ class Compared:
         return max((int(table.place.max()) for table in self.run.stages.values() if len(table.place)), default=-1)
 
 
+class Alone(Compared):
+    """A run that is compared with none: its entities stand where it recorded them."""
+
+    @property
+    def path(self) -> str:
+        return ""
+
+
 class Clock:
     """Puts another run's rows on the first run's steps and places, by their stamps, so that one cursor moves both."""
 
@@ -122,17 +130,19 @@ class Clock:
 
 
 def light(run: Run) -> Run:
-    """The run with what a comparison needs alone: beliefs, residuals and their covariances, single numbers."""
+    """The run with what a comparison needs alone: beliefs, residuals, their covariances and gains, single numbers, and
+    the readings that may be of a part of the state itself."""
     tables = {
         name: StageTable(name, t.step, t.place, {k: v for k, v in t.values.items() if _needed(k, v)}, t.spaces)
         for name, t in run.stages.items()
     }
-    return dataclasses.replace(run, stages=tables, inputs={})
+    inputs = {k: v for k, v in run.inputs.items() if k.startswith("z.") and v.shape[1] <= len(run.space.names)}
+    return dataclasses.replace(run, stages=tables, inputs=inputs)
 
 
 def _needed(name: str, values: np.ndarray) -> bool:
     tail = name.rpartition(".")[2]
-    return tail in ("mean", "cov", "log_probabilities", "residual", "offered") or is_figure(name, values)
+    return tail in ("mean", "cov", "log_probabilities", "residual", "offered", "gain") or is_figure(name, values)
 
 
 def is_figure(name: str, values: np.ndarray) -> bool:

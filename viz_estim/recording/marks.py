@@ -1,10 +1,12 @@
 """A copy of a recording with findings marked in it: lanes that say from when to when, a list to jump by, and the text.
 
-A click on a row's time in the list moves the time cursor there; a link in the text selects the finding's lane.
+A link in the text (in the viewer that `viz-estim open` starts) and a click on a row's time in the list move the time
+cursor there.
 """
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,24 +14,20 @@ from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from rerun.chunk import Chunk, RrdReader
 from rerun.error_utils import RerunWarning
 
-from viz_estim.core.spaces import Product
 from viz_estim.files import whole as whole_file
-from viz_estim.recording import schema
+from viz_estim.recording import diagnosis_view, schema
 from viz_estim.recording.columns import Times, send_static
-from viz_estim.recording.layout import as_product
+from viz_estim.recording.compared import Alone
+from viz_estim.recording.diagnosis_view import FINDINGS, LIST
 from viz_estim.recording.reader import Run
 from viz_estim.recording.rescue import whole
+from viz_estim.recording.scene_views import Scenes
 
-FINDINGS = "/findings"
-_LIST = f"{FINDINGS}/list"
 _COLOURS: dict[str, schema.Colour] = {"error": (220, 50, 50), "warning": (200, 150, 60), "note": (110, 120, 140)}
 _LEVELS = {"error": "ERROR", "warning": "WARN", "note": "INFO"}
-_PLOTS = 12  # more views at once are too small to read
-_Item = rrb.Container | rrb.View
 
 
 class Mark(NamedTuple):
@@ -48,29 +46,31 @@ def lane(mark: Mark) -> str:
 
 def write(source: Path, path: Path, run: Run, marks: list[Mark], markdown: str) -> None:
     """Copies the recording at `source`, which holds `run`, to `path`, whole or not at all, with the marks in it."""
-    with whole_file(path) as aside, rr.RecordingStream("viz_estim diagnose", send_properties=False) as stream:
+    # A view belongs to an application id: diagnoses that are open in one viewer keep their own.
+    application = "viz_estim diagnose " + re.sub(r"[^A-Za-z0-9_-]+", "-", source.stem)
+    with whole_file(path) as aside, rr.RecordingStream(application, send_properties=False) as stream:
         stream.save(aside)
         stream.send_recording_name(f"{run.properties.get('title', source.stem)} · diagnosis")
         stream.flush()  # what is logged so far comes before all chunks
-        scenes: set[str] = set()
+        alone, scenes = Alone(run, 0, source.stem, True), Scenes()
         with whole(source) as sound:
-            rr.send_chunks(_chunks(sound, scenes), recording=stream)
+            rr.send_chunks(_chunks(sound, alone, scenes), recording=stream)
         send_static(stream, FINDINGS, rr.TextDocument(markdown, media_type="text/markdown"))
         for mark in marks:
             _draw_lane(stream, run, mark)
         _draw_list(stream, run, marks)
-        stream.send_blueprint(_blueprint(run, scenes))
+        stream.send_blueprint(diagnosis_view.build(alone, scenes, len(marks), markdown))
         stream.flush()
         stream.disconnect()
 
 
-def _chunks(path: Path, scenes: set[str]) -> Iterator[Chunk]:
+def _chunks(path: Path, alone: Alone, scenes: Scenes) -> Iterator[Chunk]:
     """The recording's chunks one after the other; learns which scenes there are."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RerunWarning)  # of a run that was killed
         reader = RrdReader(path)
     for chunk in reader.stream():
-        scenes.add("/" + chunk.entity_path.split("/")[1])
+        scenes.learn(alone, chunk)
         yield chunk
 
 
@@ -99,54 +99,7 @@ def _draw_lane(stream: rr.RecordingStream, run: Run, mark: Mark) -> None:
 def _draw_list(stream: rr.RecordingStream, run: Run, marks: list[Mark]) -> None:
     marks = sorted(marks, key=lambda mark: mark.steps)
     if marks:
-        columns = rr.TextLog.columns(text=[m.text for m in marks], level=[_LEVELS[m.severity] for m in marks])
         at = _at(run, [mark.steps[0] for mark in marks])
-        rr.send_columns(_LIST, at.columns, columns, recording=stream, strict=True)
-
-
-def _blueprint(run: Run, scenes: set[str]) -> rrb.Blueprint:
-    """Findings at the left, with the list to jump by; the scene, the evidence over time and the lanes at the right."""
-    left = rrb.Vertical(
-        rrb.TextDocumentView(origin=FINDINGS, name="What is wrong"),
-        rrb.TextLogView(origin=_LIST, name="Click a time to go there"),
-        row_shares=[3, 1],
-    )
-    lanes = rrb.StateTimelineView(origin=schema.LANES, name="Lanes: findings, stages, readings")
-    spatial = [rrb.Spatial3DView(origin=scene) for scene in (schema.WORLD, schema.ATTITUDE) if scene in scenes][:1]
-    tabs = [tab for tab in (_consistency(run), _errors(run)) if tab is not None]
-    right: list[_Item] = [*spatial, *([rrb.Tabs(*tabs, active_tab=0)] if tabs else []), lanes]
-    return rrb.Blueprint(
-        rrb.Horizontal(left, rrb.Vertical(*right), column_shares=[2, 3]),
-        rrb.TimePanel(timeline="time", state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-    )
-
-
-def _consistency(run: Run) -> rrb.Container | None:
-    views: list[rrb.View] = []
-    for table in run.stages.values():
-        space = table.spaces.get("innovation")
-        if isinstance(space, Product):
-            for name, part in space.parts.items():
-                views.append(_plot("nis", name, f"NIS {name}"))
-                views += [_plot("innovation", f"{name}.{axis}", f"innovation {name} {axis}") for axis in part.axes]
-    return rrb.Grid(*views[:_PLOTS], name="Innovations") if views else None
-
-
-def _errors(run: Run) -> rrb.Container | None:
-    space = as_product(run.space)
-    views = [
-        _plot("error", f"{name}.{axis}", f"error {name} {axis}")
-        for name, part in space.parts.items()
-        if not run.labels and np.isfinite(run.truth[:, space.at[name]]).any()
-        for axis in part.axes
-    ]
-    return rrb.Grid(*views[:_PLOTS], name="Errors") if views else None
-
-
-def _plot(group: str, component: str, name: str) -> rrb.TimeSeriesView:
-    hidden = rrb.PlotLegend("LeftTop", visible=False)
-    return rrb.TimeSeriesView(
-        origin=schema.plot(group, component), name=name, axis_x=rrb.TimeAxis(link="LinkToGlobal"), plot_legend=hidden
-    )
+        texts = [f"{time:.2f} s · {mark.text}" for time, mark in zip(at.time, marks, strict=True)]
+        columns = rr.TextLog.columns(text=texts, level=[_LEVELS[m.severity] for m in marks])
+        rr.send_columns(LIST, at.columns, columns, recording=stream, strict=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,7 @@ from rerun.chunk import Chunk, RrdReader
 from rerun.error_utils import RerunWarning
 
 from viz_estim.files import whole as whole_file
-from viz_estim.recording import comparison_view, schema
+from viz_estim.recording import comparison_view, scene_views, schema
 from viz_estim.recording.columns import send_static
 from viz_estim.recording.compared import Clock, Compared
 from viz_estim.recording.overlays import Overlays
@@ -31,11 +32,13 @@ def write(path: Path, runs: list[Compared], result: dict[str, Any], notes: str) 
     that is the first run's is kept there alone. What is over time is drawn over all of them at once, from the runs'
     numbers. result: kept as a property; notes: markdown.
     """
-    with whole_file(path) as aside, rr.RecordingStream("viz_estim compare", send_properties=False) as stream:
+    # A view belongs to an application id: comparisons that are open in one viewer keep their own.
+    application = "viz_estim compare " + re.sub(r"[^A-Za-z0-9_-]+", "-", " ".join(run.name for run in runs))
+    with whole_file(path) as aside, rr.RecordingStream(application, send_properties=False) as stream:
         stream.save(aside)
         stream.send_recording_name(" · ".join(run.name for run in runs))
         stream.flush()  # what is logged so far comes before all chunks
-        scenes = comparison_view.Scenes()
+        scenes = scene_views.Scenes()
         for run in runs:
             _stream_through(stream, run, Clock(runs[0], run), scenes)
         overlays = Overlays(stream, runs)
@@ -43,12 +46,12 @@ def write(path: Path, runs: list[Compared], result: dict[str, Any], notes: str) 
         send_static(stream, schema.NOTES, rr.TextDocument(notes, media_type="text/markdown"))
         texts = rr.AnyValues(drop_untyped_nones=False, result=json.dumps(result))
         send_static(stream, "/__properties/viz_estim_comparison", texts)
-        stream.send_blueprint(comparison_view.build(runs, scenes, overlays.plots))
+        stream.send_blueprint(comparison_view.build(runs, scenes, overlays.plots, notes))
         stream.flush()
         stream.disconnect()
 
 
-def _stream_through(stream: rr.RecordingStream, run: Compared, clock: Clock, scenes: comparison_view.Scenes) -> None:
+def _stream_through(stream: rr.RecordingStream, run: Compared, clock: Clock, scenes: scene_views.Scenes) -> None:
     """Sends a recording's chunks on, one after the other: none is kept."""
 
     def chunks(path: Path) -> Iterator[Chunk]:
@@ -70,7 +73,7 @@ def _stream_through(stream: rr.RecordingStream, run: Compared, clock: Clock, sce
 def _moved(chunk: Chunk, path: str, run: Compared, clock: Clock) -> Chunk:
     """The chunk under another path: what is amber gets the run's colour, its rows the first run's steps and stages."""
     shifted = not (chunk.is_static or clock.same)
-    coloured = run.place and comparison_view.scene_of(chunk.entity_path)
+    coloured = run.place and scene_views.scene_of(chunk.entity_path)
     if not (shifted or coloured):
         return chunk.with_entity_path(path)
     batch = chunk.to_record_batch()

@@ -195,7 +195,11 @@ ENTITIES = (
     Entry(EVENTS, "`TextLog`: what ended a run"),
     Entry(NOTES, "`TextDocument`: what to look at"),
     Entry("/runs/{run}/…", "in a comparison: a run's own entities, on the first run's steps and stages"),
-    Entry("/plots/{group}/{quantity}/{run}", "in a comparison: each run's line; `-truth` is drawn once", _PART_S),
+    Entry(
+        "/plots/{group}/{quantity}/{run}",
+        "in a comparison: each run's line (`moved`: K·ν of all readings); `-truth`, `-reading` once",
+        _PART_S,
+    ),
     Entry(
         "/__properties/viz_estim",
         "scenario, parameters, seed, data files with their SHA-256, versions, spaces, the result (JSON texts)",

@@ -15,6 +15,7 @@ from typing import Any
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient, ViewerState
 
+from viz_estim.recording import links
 from viz_estim.recording.rescue import whole
 
 START_S, SEEK_S, LOAD_S, LOAD_BYTES_PER_S = 30.0, 2.0, 10.0, 10e6  # the longest waits, for slow machines
@@ -95,6 +96,10 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
         else:
             raise ViewerError(f"{path}: has no data on any timeline; is it a recording?")
         self._ask(self._client.set_time, play_state="paused")
+        for recording in new:
+            blueprint = self._ask(self._client.get_blueprint, store_id=recording.store_id).blueprint
+            if linked := links.moving(blueprint, state.catalog_url or "", recording.store_id):
+                self._ask(self._client.set_blueprint, linked, store_id=recording.store_id)
 
     def seek(self, timeline: str, value: float | None = None) -> None:
         """Moves the front recording's cursor, and waits until it is there; a moment still on its way is waited for.

@@ -1,0 +1,159 @@
+"""The view of a diagnosis: what is wrong in words, and beside it the scene, the evidence over time and the lanes."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TextLogColumn, TextLogColumnKind
+
+from viz_estim.core.consistency import band
+from viz_estim.recording import links, schema
+from viz_estim.recording.compared import Alone, is_figure
+from viz_estim.recording.layout import as_product
+from viz_estim.recording.lines import shown
+from viz_estim.recording.pictures import CANVAS
+from viz_estim.recording.scene_views import Scenes, view
+from viz_estim.recording.sheet import titled
+
+FINDINGS = "/findings"
+LIST = f"{FINDINGS}/list"
+_ROWS = 3  # of plots in one tab
+_Item = rrb.Container | rrb.View
+_Plots = list[rrb.TimeSeriesView]
+_NAMES = {schema.WORLD: "World [m]", schema.ATTITUDE: "Attitude", schema.BARS: "Probabilities", CANVAS: "Mosaic [deg]"}
+
+
+def build(alone: Alone, scenes: Scenes, findings: int, markdown: str) -> rrb.Blueprint:
+    """Findings at the left, with a list to jump by where there are any; scene, evidence and lanes at the right."""
+    columns = [TextLogColumn(kind) for kind in (TextLogColumnKind.LogLevel, TextLogColumnKind.Body)]
+    texts: list[_Item] = [links.panel(FINDINGS, "What is wrong", markdown)]
+    if findings:
+        columned = rrb.archetypes.TextLogColumns(text_log_columns=columns)
+        texts.append(rrb.TextLogView(origin=LIST, name="Click a time to go there", columns=columned))
+    lanes = rrb.StateTimelineView(origin=schema.LANES, name="Lanes: findings, stages, readings")
+    spatial = _spatial(alone, scenes)
+    tabs = [tab for title, plots in _evidence(alone) for tab in _tabs(title, plots)]
+    right: list[_Item] = [
+        *([rrb.Tabs(*spatial, active_tab=0)] if spatial else []),
+        *([rrb.Tabs(*tabs, active_tab=0)] if tabs else []),
+        lanes,
+    ]
+    sensors = {name.partition(".")[2] for name in alone.run.inputs if "." in name}
+    count = findings + len(sensors) + 1 + bool(alone.run.labels)  # a lane is some 40 pixels high
+    low = min(0.42, 0.06 + 0.045 * count)
+    rest = (1 - low) / max(1, len(right) - 1)
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(*texts, row_shares=[3, 1][: len(texts)]),
+            rrb.Vertical(*right, row_shares=[rest] * (len(right) - 1) + [low]),
+            column_shares=[2, 3],
+        ),
+        rrb.TimePanel(timeline="time", state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def _spatial(alone: Alone, scenes: Scenes) -> list[rrb.View]:
+    found = []
+    for scene, word in _NAMES.items():
+        if scene in scenes.runs:
+            truth = ", truth white" if scene[1:] in scenes.truths else ""
+            name = f"{word}: {_shown(alone)} amber{truth}" if scene in (schema.ATTITUDE, schema.WORLD) else word
+            found.append(view(scene, [alone], alone, scenes, name, 2.8))
+    return found
+
+
+def _shown(alone: Alone) -> str:
+    """What stands for the estimate."""
+    stages = alone.run.stages
+    return "moved cloud" if "align" in stages else "particles" if alone.run.properties.get("particles") else "estimate"
+
+
+def _evidence(alone: Alone) -> list[tuple[str, list[_Plots]]]:
+    """Tabs by title, each with its plots, those of one thing together."""
+    return [
+        (title, groups)
+        for title, groups in (
+            ("Innovations", _innovations(alone)),
+            ("Errors", _errors(alone)),
+            ("Belief", _belief(alone)),
+            ("Figures", _figures(alone)),
+        )
+        if groups
+    ]
+
+
+def _innovations(alone: Alone) -> list[_Plots]:
+    groups = []
+    for table in alone.run.stages.values():
+        for name, part in as_product(table.spaces.get("innovation")).parts.items():
+            dof = len(part.axes)
+            top = rrb.ScalarAxis(range=(0.0, 4 * band(dof)[1]))
+            views = [_plot("nis", name, f"NIS {name}", top)]
+            for axis, unit in zip(part.axes, part.axis_units, strict=True):
+                views.append(_plot("innovation", f"{name}.{axis}", titled(name, axis, shown(unit)[0], "innov.")))
+            groups.append(views)
+    return groups
+
+
+def _errors(alone: Alone) -> list[_Plots]:
+    run, space = alone.run, alone.space
+    return [
+        [
+            _plot("error", f"{name}.{axis}", titled(name, axis, shown(unit)[0], "error"))
+            for axis, unit in zip(part.axes, part.axis_units, strict=True)
+        ]
+        for name, part in space.parts.items()
+        if np.isfinite(run.truth[:, space.at[name]]).any()
+    ]
+
+
+def _belief(alone: Alone) -> list[_Plots]:
+    if not alone.run.labels:
+        return []
+    return [
+        [_plot("probability", "labels", "Probability of each label", rrb.ScalarAxis(range=(0.0, 1.0)), legend=True)]
+    ]
+
+
+def _figures(alone: Alone) -> list[_Plots]:
+    groups = [
+        [
+            _plot("figure", f"{table.name}.{name}", f"{table.name}: {name}")
+            for name, values in table.values.items()
+            if is_figure(name, values) and np.isfinite(values).any()
+        ]
+        for table in alone.run.stages.values()
+    ]
+    return [group for group in groups if group]
+
+
+def _tabs(title: str, groups: list[_Plots]) -> list[_Item]:
+    """The plots in rows of at most four, in as many tabs as keep them readable."""
+    rows: list[_Plots] = []
+    for group in groups:
+        if rows and len(rows[-1]) + len(group) <= 4:
+            rows[-1] += group
+        else:
+            across = 3 if len(group) % 3 == 0 else 4
+            rows += [group[i : i + across] for i in range(0, len(group), across)]
+    count = -(-len(rows) // _ROWS)
+    size = -(-len(rows) // count)
+    parts = [rows[i : i + size] for i in range(0, len(rows), size)]
+    return [
+        rrb.Vertical(*(rrb.Horizontal(*row) for row in part), name=f"{title} {i}" if i > 1 else title)
+        for i, part in enumerate(parts, 1)
+    ]
+
+
+def _plot(
+    group: str, component: str, name: str, axis: rrb.ScalarAxis | None = None, *, legend: bool = False
+) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin=schema.plot(group, component),
+        name=name,
+        axis_y=axis,
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
+    )
