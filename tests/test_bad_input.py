@@ -84,6 +84,7 @@ BAD_COMMANDS: dict[str, tuple[list[str], str]] = {
     "no such choice": ([*RUN, "--set", "frozen=maybe"], "ignore or reject"),
     "noise of zero": ([*RUN, "--set", "gyro_noise=0"], "gyro_noise must be a positive number"),
     "negative noise": ([*RUN, "--set", "accel_noise=-1"], "accel_noise must be a positive number"),
+    "noise without bound": ([*RUN, "--set", "gyro_noise=1e300"], "gyro_noise=1e+300 is too large"),
     "negative standard deviation": ([*RUN, "--set", "initial_rate_std=-1"], "initial_rate_std"),
     "gate of one": ([*RUN, "--set", "gyro_gate=1"], "gyro_gate is a probability"),
     "gate of zero": ([*RUN, "--set", "accel_gate=0"], "accel_gate is a probability"),

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
+
 from viz_estim import diagnosing, printing
 from viz_estim.debugger import commands as debugging
 from viz_estim.errors import BadInput
@@ -23,7 +25,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         arguments = _parser().parse_args(argv)
         command: Callable[[argparse.Namespace], int | None] = arguments.command
-        return command(arguments) or 0
+        with np.errstate(over="ignore"):  # what overflows is infinite, and the run ends where that is seen
+            return command(arguments) or 0
     except _Usage as error:
         return _refuse(str(error))
     except BadInput as error:

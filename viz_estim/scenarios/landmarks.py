@@ -24,7 +24,8 @@ from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, whole
 from viz_estim.scenarios.checks import positive, probability
 from viz_estim.scenarios.ranges import directions, distances
-from viz_estim.scenarios.reading import expand, finite, read_columns
+from viz_estim.scenarios.reading import expand, finite
+from viz_estim.scenarios.tables import read_table
 
 _SUFFIXES = (".csv", ".npz")
 _RANGES = ("range_1", "range_2")
@@ -199,10 +200,9 @@ def _load(source: list[Path]) -> LandmarksData:
     path = found[0]
     if path.suffix.lower() not in _SUFFIXES:
         raise BadInput(f"{path}: expected a data file that ends in {' or '.join(_SUFFIXES)}")
-    columns = {name.lower(): values for name, values in read_columns(path, "time").items()}
-    missing = [name for name in _NEEDED if name not in columns]
-    if missing:
-        raise BadInput(f"{path}: missing {', '.join(missing)} (columns: {', '.join(columns)})")
+    table = read_table(path)
+    table.require(_NEEDED)
+    columns = table.columns((*_NEEDED, *_TRUTH))
     for name in _NEEDED:
         finite(columns[name], path, name)
     time = columns["time"]
@@ -224,6 +224,6 @@ def _load(source: list[Path]) -> LandmarksData:
 
 def _is_ours(path: Path) -> bool:
     try:
-        return set(_NEEDED) <= {name.lower() for name in read_columns(path, "time")}
+        return set(_NEEDED) <= set(read_table(path).names)
     except BadInput:
         return False

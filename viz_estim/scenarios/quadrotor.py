@@ -45,7 +45,8 @@ def quadrotor(
     if flight_file:
         flight = quadrotor_files.load_flight(flight_file)
         if seen:
-            return together(flight, seen, "measured by the camera; the truth is motion capture.", files)
+            known = "the truth is motion capture" if len(flight.states) else "nothing tells the truth"
+            return together(flight, seen, f"measured by the camera; {known}.", files)
         seen = motion_capture(flight)
         notes = (
             "no camera's measurements, so that motion capture serves as the measured pose, and is the truth too: the "
