@@ -110,6 +110,7 @@ BAD_COMMANDS: dict[str, tuple[list[str], str]] = {
     "show: time that is no number": (["show", "{rec}", "--time", "nan"], "nan"),
     "show: step and time": (["show", "{rec}", "--step", "1", "--time", "1"], "not allowed"),
     "export: over its own recording": (["export", "{rec}", "--to", "csv", "-o", "{rec}"], "must end in .csv"),
+    "no place for recordings": (["run", "parameter-ekf", "--seed", "1"], "recordings: cannot be made here"),
     "run: a calibration as data": (["run", "imu-ukf", "--data", "{}/text.json"], "expected a data file"),
     "run: no such calibration": (
         ["run", "imu-ukf", "--seed", "1", "--calibration", "{}/no.json"],
@@ -168,7 +169,9 @@ def test_bad_data_is_refused(what: str, cli: Cli, course: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize("what", BAD_COMMANDS)
 @pytest.mark.usefixtures("no_display")
-def test_bad_usage_is_refused(what: str, cli: Cli, course: Path, recording: Path, tmp_path: Path) -> None:
+def test_bad_usage_is_refused(
+    what: str, cli: Cli, course: Path, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     arguments, words = BAD_COMMANDS[what]
     for folder in ("empty", "sets", "folder.rrd"):
         (tmp_path / folder).mkdir()
@@ -177,6 +180,9 @@ def test_bad_usage_is_refused(what: str, cli: Cli, course: Path, recording: Path
     for name, content in {**files, "a.png": "precious", "a.csv": "precious", "garbage.rrd": "RRF2garbage"}.items():
         (tmp_path / name).write_text(content)
     given = [argument.format(tmp_path, rec=recording) for argument in arguments]
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "recordings").write_text("a file of that name")
+    monkeypatch.chdir(tmp_path / "here")
     assert_refused(cli, tmp_path, given, words)
 
 

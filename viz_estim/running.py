@@ -19,7 +19,7 @@ import numpy as np
 from viz_estim.core.consistency import Tally
 from viz_estim.core.run import Scenario, Step, run
 from viz_estim.errors import BadInput
-from viz_estim.files import check_writable, sha256
+from viz_estim.files import check_writable, make_folder, sha256
 from viz_estim.parameters import assign, nearest, parameters
 from viz_estim.recording.recorder import Recorder
 from viz_estim.scenarios import SCENARIOS, SYSTEMS
@@ -234,7 +234,7 @@ def execute(planned: Plan, out: Path | None, *, every: int, live: str | None, pr
     scenario = planned.build()
     path = out or Path("recordings") / f"{planned.title()}.rrd"
     if out is None:
-        path.parent.mkdir(exist_ok=True)
+        make_folder(path.parent)
     check_writable(path, suffix=".rrd")
     properties = planned.properties(scenario)
     with Recorder(path, scenario, properties, every=every, live=live) as recorder:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -26,5 +27,7 @@ def simulate(system: str, settings: list[str], seed: int, folder: Path) -> list[
     if folder.exists() and not folder.is_dir():
         raise BadInput(f"{folder}: is a file, expected a folder")
     folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise BadInput(f"{folder}: nothing can be written there (permission denied); choose another folder")
     written: list[Path] = module.save(data, folder)
     return written

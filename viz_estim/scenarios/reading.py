@@ -81,6 +81,11 @@ def finite(values: Array, path: Path, name: str) -> Array:
 
 def unreadable(path: Path, error: Exception) -> BadInput:
     """What to say of a file that its reader tripped over."""
+    try:
+        with path.open("rb"):
+            pass
+    except OSError as closed:
+        return BadInput(f"{path}: cannot be opened ({closed.strerror})")
     if _is_hdf5(path):
         return BadInput(f"{path}: {_HDF5}")
     text = " ".join(str(error).split()) or type(error).__name__

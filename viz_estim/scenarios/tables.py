@@ -107,6 +107,8 @@ def read_table(path: Path, spellings: dict[str, str] | None = None) -> Table:
 
 
 def _read_npz(path: Path) -> Table:
+    with path.open("rb"):  # else nobody says why it is none
+        pass
     if not zipfile.is_zipfile(path):
         raise BadInput(f"{path}: cannot be read, it is no .npz or truncated; write it with numpy.savez(FILE, NAME=…)")
     cells: list[np.ndarray | BadInput] = []
