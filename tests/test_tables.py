@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import scipy.io
 
+from viz_estim import estimate_rot
 from viz_estim.core.quaternions import Array
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import SYSTEMS
-from viz_estim.scenarios.imu_files import find_sets, load
+from viz_estim.scenarios.imu_files import find_sets, load, of_course
 from viz_estim.scenarios.reading import mat_shapes, read_mat
 from viz_estim.scenarios.tables import read_table
 
@@ -140,6 +141,20 @@ def test_matlab_s_newest_format_is_refused_with_what_to_do(system: str, in_folde
     with pytest.raises(BadInput, match=r"imuRaw1.mat: .*v7\.3 .*save\(FILE, '-v7'\)") as caught:
         getattr(SYSTEMS[system], system)([tmp_path if in_folder else path], np.random.default_rng(0))
     assert len(str(caught.value)) < 300 + len(str(path))
+
+
+def test_a_file_is_meant_by_its_path_or_its_number(
+    counts: dict[str, Array], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "imu").mkdir()
+    monkeypatch.chdir(tmp_path)
+    path = Path("imu", "imuRaw3.mat")
+    scipy.io.savemat(path, counts)
+    for name in (3, np.int64(3), str(path), path, "imu/imuRaw3", tmp_path / "imu" / "imuRaw3"):
+        assert of_course(name).samefile(path)
+    assert [angles.shape for angles in estimate_rot(3)] == [(40,)] * 3
+    with pytest.raises(BadInput, match="no such file"):
+        estimate_rot(4)
 
 
 def test_stamps_in_another_unit_are_refused(counts: dict[str, Array], tmp_path: Path) -> None:

@@ -62,6 +62,16 @@ def find_sets(paths: list[Path]) -> list[tuple[Path, Path | None]]:
     return [(imu, _truth_of(imu, truths)) for imu in imus]
 
 
+def of_course(name: str | Path | int) -> Path:
+    """The IMU file that is meant: by its path, with or without `.mat`, or by its number, here or in `imu/`."""
+    given = f"imuRaw{name}" if isinstance(name, (int, np.integer)) else str(name)
+    wanted = [Path(given), Path(f"{given}.mat"), Path("imu", f"{given}.mat")]
+    found = next((path for path in wanted if path.is_file()), None)
+    if found is None:
+        raise BadInput(f"{given}: no such file; looked for {', '.join(map(str, wanted))} in {Path.cwd()}")
+    return found
+
+
 def load(imu: Path, truth: Path | None) -> ImuLog:
     """The IMU file read and checked, with its reference."""
     if imu.suffix.lower() == ".mat":
