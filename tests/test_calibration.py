@@ -91,6 +91,9 @@ def test_the_clocks_offset_is_found(simulated, fits, late):
     moved = shifted.sets[0].time_offset_s - fits[2].sets[0].time_offset_s
     assert moved == pytest.approx(late, abs=5e-4)  # positive: the truth's stamps are late
     np.testing.assert_allclose(shifted.calibration.gyro_sensitivity, fits[2].calibration.gyro_sensitivity, atol=0.3)
+    for one in (shifted.sets[0], *(fit.sets[0] for fit in fits)):
+        known = late if one is shifted.sets[0] else 0.0
+        assert abs(one.time_offset_s - known) < 3.5 * one.time_offset_se
 
 
 def test_noise_in_the_reference_does_not_pull_the_gain(simulated):
