@@ -188,8 +188,11 @@ def test_bad_input_is_one_line(simulated):
         "accel": np.resize(log.accel[still], log.accel.shape),
         "gyro": np.resize(log.gyro[still], log.gyro.shape),
     }
+    mirrored = log.gyro * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * 370.0]
     cases = {
         "at least one set": [],
+        "the gyro's sensitivity along z comes out as": [replace(log, gyro=mirrored)],
+        "the accel's sensitivity along x comes out as -": [replace(log, accel=log.accel * [-1, 1, 1] + [1023, 0, 0])],
         "SI units": [replace(log, in_counts=False)],
         "no motion capture": [log, replace(log, truth_stamps=np.empty(0), truth=np.empty((0, 4)))],
         "of this set": [replace(log, truth_stamps=log.truth_stamps + 1000.0)],

@@ -26,6 +26,7 @@ _LARGEST_OFFSET = 0.1  # s, between the two clocks
 _BLOCK = 1.0  # s: residuals in different blocks are taken as independent
 _LEAST_RATE = 0.03  # rad/s rms about an axis, over all sets: below, there is nothing but the reference's noise
 _LEAST_SWING = 0.05  # of gravity, from the 5th to the 95th percentile of what a channel sees over all sets
+_LARGEST_RATIO = 2.0  # of a sensitivity to the documented one: beyond, it is another sensor, or another row
 _LARGEST_ERROR = 0.05  # of a sensitivity: with less certainty it is not worth having
 
 
@@ -120,12 +121,22 @@ def fit(logs: list[ImuLog]) -> Fit:
                 "don't belong together; give the file that does, or shift its stamps"
             )
     (accel_bias, accel_sensitivity), accel_se = _fit_accel(sets, offsets)
-    for sensor, value, error in (("gyro", gyro_sensitivity, gyro_se[1]), ("accel", accel_sensitivity, accel_se[1])):
-        vague = ~(error < _LARGEST_ERROR * value)
+    for sensor, value, error, documented in (
+        ("gyro", gyro_sensitivity, gyro_se[1], DOCUMENTED.gyro_sensitivity),
+        ("accel", accel_sensitivity, accel_se[1], DOCUMENTED.accel_sensitivity),
+    ):
+        vague = ~(error < _LARGEST_ERROR * np.abs(value))
         if vague.any():
             raise BadInput(
                 f"{names}: the {sensor}'s sensitivity along {_axes(vague)} stays unsure ({value[vague][0]:.3g} ± "
                 f"{error[vague][0]:.2g}): too little motion, or not the files of one set; add a set that turns more"
+            )
+        foreign = ~(np.abs(np.log(np.maximum(value / documented, 1e-300))) < np.log(_LARGEST_RATIO))
+        if foreign.any():
+            raise BadInput(
+                f"{names}: the {sensor}'s sensitivity along {_axes(foreign)} comes out as {value[foreign][0]:.3g}, "
+                f"{documented[foreign][0]:.3g} is documented: are the rows ax, ay, az, wz, wx, wy, in counts, with the "
+                "course's signs?"
             )
     after = Calibration(accel_bias, accel_sensitivity, gyro_sensitivity, gyro_bias)
     residuals: dict[str, dict[str, dict[str, list[float]]]] = {"accel_mps2": {}, "gyro_deg": {}}
