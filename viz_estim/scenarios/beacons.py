@@ -151,14 +151,11 @@ def _notes(particles: int) -> str:
     dense = particles / (_AREA.prod() * 2 * np.pi)
     return (
         "The start is unknown. **Step 0**: two ranges leave two places, mirrored at the line through the beacons, and "
-        "every heading. After some 10 steps the headings have sorted themselves out and **two clouds drive towards "
-        "that line**, one of them the mirror image. Their mean lies between them, where nobody is: look at the cloud. "
-        "Where they meet at the line, both give the right ranges; beyond it each has to bend its own way, and **the "
-        "turn decides**: the image would have to turn right where the inputs say left, and its weights die out.\n\n"
-        f"**Why the noise is widened.** {particles} particles are {dense:.1g} to a square metre and radian, and "
-        "resampling keeps only those that the first readings happen to favour. With the true noises "
-        "(`range_noise=0.51 speed_noise=0.105 turn_noise=0.09`) each step moves a particle by 1 cm and half a degree: "
-        "copies stay copies, the few ancestors that are left lie beside the truth, and whichever image has the better "
-        "ones takes all. Watch the distinct ancestors at the first resamplings and the evidence, which falls when the "
-        "true mode is lost. `particles=20000` keeps it; so does wider noise, at the price of a broader cloud."
+        "every heading. After some 10 steps **two clouds drive towards that line**, one the mirror image. Their "
+        "mean lies between them, where nobody is. Beyond the line **the turn decides**: the image would have to turn "
+        "right where the inputs say left, and its weights die out.\n\n"
+        f"**Why the noise is widened.** {particles} particles are {dense:.1g} to a square metre and radian. With the "
+        "true noises (`range_noise=0.51 speed_noise=0.105 turn_noise=0.09`) copies stay copies: whichever image has "
+        "the better few ancestors takes all. The tab *Figures* has the ancestors and the evidence, which falls when "
+        "the true mode is lost. `particles=20000` keeps it; so does wider noise, at the price of a broader cloud."
     )

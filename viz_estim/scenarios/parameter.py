@@ -34,7 +34,7 @@ _START_MEAN, _START_VARIANCE = 1.0, 2.0  # of x₀
 _PROCESS_STD, _READING_STD = 1.0, math.sqrt(0.5)
 _TRUE_A = -1.0
 _SEEDS = 200
-_NOTES = """The EKF learns **a** from readings that tell only |x|. Follow `a` and its ±σ against the truth, −1.
+_NOTES = """The EKF learns **a** from readings that tell only |x|. The tab *State* has **a** ±σ beside the truth, −1.
 
 - From `prior_a=-0.5` it settles near −1, from `prior_a=0.5` near +1, and fits the readings exactly as well: a and −a,
   with every other x turned round, give the same y. **The sign is the prior's, not the data's**; from 0 it never moves.

@@ -138,12 +138,10 @@ def _notes(data: ScanData, max_distance: float, iterations: int) -> str:
         else f"It ends when the matches repeat, for then nothing moves any more, or after {_MOST} iterations. "
     )
     return (
-        f"X ({len(data.X)} points) is moved on to Y ({len(data.Y)}), one iteration a step. In **match** each point of "
-        f"X has a line to its nearest in Y, coloured by its length; points further than {max_distance:g} m from all of "
-        "Y have none. Long lines that lean one way are what is left to move; long lines at a rim are points that the "
-        "other scan never saw. In **align** the pose is fitted to these pairs.\n\n"
-        "While **K**, the number of matches, rises, RMSE may rise with it, for the new pairs are the long ones: "
-        f"compare it at one K only. {end}Repeating is no proof of being right: from a start too far off, or with "
-        "max_distance too small, the matches can repeat at a wrong pose. The covariance takes every match as right, so "
-        "that it is far too small: look at **NEES**."
+        f"X ({len(data.X)} points) is moved on to Y ({len(data.Y)}), one iteration a step. **match** draws a line from "
+        f"each point of X to its nearest in Y within {max_distance:g} m; **align** fits the pose to these pairs. Long "
+        "lines that lean one way are what is left to move; at a rim they are points that the other scan never saw.\n\n"
+        "While **K**, the count of matches, rises, RMSE may rise with it: the new pairs are the long ones. "
+        f"{end}Repeating is no proof of being right: from a start too far off, the matches can repeat at a wrong pose. "
+        "The covariance takes every match as right, so that it is far too small (**NEES**)."
     )
