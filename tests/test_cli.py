@@ -192,6 +192,21 @@ def test_show_tells_how_many_particles_there_are_and_what_they_are_worth(
     assert f"{particles}, ESS " in cli("show", out, "--step", 3).out
 
 
+def test_stages_are_there_where_nothing_of_them_is_kept(cli: Cli, tmp_path: Path) -> None:
+    """The problem has five steps: of `predict`, `--every 5` keeps no cloud at all."""
+    shown = []
+    for every in (1, 5):
+        out = tmp_path / f"{every}.rrd"
+        strict(cli("run", "se2-pf", "--every", every, "--out", out, "--json"))
+        shown.append([strict(cli("show", out, "--step", step, "--json"))["stages"] for step in range(5)])
+    whole, thinned = shown
+    assert [[stage["name"] for stage in stages] for stages in thinned] == [
+        [stage["name"] for stage in stages] for stages in whole
+    ]
+    for name in ("mean", "cov"):
+        assert thinned[4][-1]["belief"][name] == whole[4][-1]["belief"][name]
+
+
 def test_a_belief_over_labels_has_no_trajectory(cli: Cli, tmp_path: Path) -> None:
     sample = Path(__file__).parents[1] / "recordings" / "underwater-bayes-sample.rrd"
     done = cli("export", sample, "--to", "tum", "-o", tmp_path / "a.tum")
