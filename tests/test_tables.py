@@ -116,6 +116,7 @@ def test_the_course_s_fields_are_found_where_other_people_put_them(
     np.testing.assert_array_equal(log.accel.T, counts["vals"][:3])
     np.testing.assert_array_equal(log.stamps, counts["ts"][0])
     assert log.truth.tolist() == [[1, 0, 0, 0]] * 40
+    (tmp_path / "steps.csv").write_text("time,steps\n0,1\n1,2\n")
     assert find_sets([tmp_path]) == [(tmp_path / "imuRaw01.mat", tmp_path / "viconRot1.mat")]
 
 

@@ -117,7 +117,9 @@ def _role(path: Path, *, strict: bool) -> str | None:
             fields = {name.lower() for name in mat_shapes(path)}
             role = "truth" if "rots" in fields else "imu" if "vals" in fields else "camera" if "cam" in fields else None
         else:
-            role = "imu" if "time" in _table(path) else None
+            # A file that was named itself is told what it lacks; others with stamps of their own may lie beside.
+            names = _table(path).names
+            role = "imu" if "time" in names and (strict or set(_CHANNELS) <= set(names)) else None
     except BadInput:
         if strict:
             raise
