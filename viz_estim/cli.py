@@ -37,6 +37,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _refuse(f"{where}{error.strerror or error}")
+    except MemoryError as error:
+        return _refuse(f"not enough memory ({error or 'out of memory'}); ask for less: fewer particles, a shorter run")
     except KeyboardInterrupt:
         return _refuse("interrupted; what was recorded so far is in the .partial.rrd file", 130)
     except RuntimeError as error:

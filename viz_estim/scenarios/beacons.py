@@ -21,7 +21,7 @@ from viz_estim.core.scenery import Box, Landmarks
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import beacons_files
 from viz_estim.scenarios.beacons_files import PERIOD, BeaconLog
-from viz_estim.scenarios.checks import positive
+from viz_estim.scenarios.checks import at_most, positive
 from viz_estim.scenarios.diffdrive_model import SPACE, moved, path
 from viz_estim.scenarios.ranges import distances
 
@@ -95,6 +95,7 @@ def beacons_pf(
     positive(range_noise=range_noise, speed_noise=speed_noise, turn_noise=turn_noise)
     if particles < 1:
         raise BadInput(f"particles must be at least 1, got {particles}")
+    at_most(1e7, particles=particles)
     if not 0 < resample_below <= 1:
         raise BadInput(f"resample_below is a fraction above 0 and up to 1, got {resample_below:g}")
     log = data.log

@@ -18,6 +18,13 @@ def positive(**values: float | None) -> None:
             raise BadInput(f"{name}={value:g} is too large; {_LARGEST:g} is the most")
 
 
+def at_most(limit: float, **values: float) -> None:
+    """BadInput where a size that is asked for is more than a machine holds or a person looks at."""
+    for name, value in values.items():
+        if not value <= limit:
+            raise BadInput(f"{name} must be at most {limit:g}, got {value:g}")
+
+
 def probability(name: str, value: float | None) -> float | None:
     """The value, where it is none or lies between 0 and 1."""
     if value is not None and not 0 < value < 1:

@@ -22,7 +22,7 @@ from viz_estim.core.scenery import Landmarks
 from viz_estim.core.spaces import Euclidean, Product
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, whole
-from viz_estim.scenarios.checks import positive, probability
+from viz_estim.scenarios.checks import at_most, positive, probability
 from viz_estim.scenarios.ranges import directions, distances
 from viz_estim.scenarios.reading import expand, finite
 from viz_estim.scenarios.tables import read_table
@@ -64,6 +64,7 @@ def landmarks(
     if source is not None:
         return _load(source)
     positive(duration=duration, rate=rate, accel_noise=accel_noise, range_noise=range_noise)
+    at_most(1e6, readings=duration * rate)
     time = np.arange(int(duration * rate) + 1) / rate
     if len(time) < 2:
         raise BadInput(f"duration={duration:g} s at rate={rate:g} has fewer than two readings; make one of them larger")

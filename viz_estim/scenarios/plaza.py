@@ -23,7 +23,7 @@ from viz_estim.core.scenery import Landmarks
 from viz_estim.core.spaces import SO2, Euclidean, Product, Space
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import plaza_files, plaza_simulation
-from viz_estim.scenarios.checks import positive, probability
+from viz_estim.scenarios.checks import at_most, positive, probability
 from viz_estim.scenarios.plaza_data import PlazaData, advance, located, prepare
 from viz_estim.scenarios.ranges import directions, distances
 
@@ -51,6 +51,7 @@ def plaza(
     if source is not None:
         return prepare(plaza_files.load(plaza_files.find(source)))
     positive(duration=duration, rate=rate, range_noise=range_noise)
+    at_most(1e6, duration=duration, rows=duration * rate)
     if duration < 5 or duration * rate < 10 or not 0 <= outliers < 1 or range_scale <= -1:
         raise BadInput(
             "a simulation needs duration ≥ 5 s and ≥ 10 rows, 0 ≤ outliers < 1 and range_scale > -1: "

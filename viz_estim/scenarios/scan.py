@@ -17,7 +17,7 @@ from viz_estim.core.scenery import Cloud
 from viz_estim.core.stages import Align
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import scan_files
-from viz_estim.scenarios.checks import positive
+from viz_estim.scenarios.checks import at_most, positive
 from viz_estim.scenarios.scan_files import ScanData
 
 _MOST = 200  # iterations, where none are prescribed
@@ -60,6 +60,7 @@ def scan(
         return scan_files.load(source)
     if points < 3 or noise < 0:
         raise BadInput(f"a simulation needs points ≥ 3 and noise ≥ 0: got points={points}, noise={noise:g}")
+    at_most(1e6, points=points)
     d = 2 if planar else 3
     turn = _TURN * rng.standard_normal(3)
     R = quaternions.to_matrix(quaternions.exp(turn * (0, 0, 1) if planar else turn))[:d, :d]
