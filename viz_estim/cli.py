@@ -214,6 +214,7 @@ def _snapshot(arguments: argparse.Namespace) -> None:
     except NotARun:  # such as a calibration's picture: the viewer knows its moments
         given = {"step": arguments.step, "time": arguments.time, "stage": arguments.stage}
         timeline, value = next(((name, v) for name, v in given.items() if v is not None), ("time", None))
+    _working("drawing")
     try:
         problems = snapshot(arguments.file, arguments.out, timeline=timeline, value=value, size=arguments.size)
     except ViewerError as error:
@@ -241,6 +242,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     from viz_estim.compare import compare
     from viz_estim.recording.viewer import open_files
 
+    _working("comparing")
     result, text = compare(arguments.files, arguments.out, arguments.tol)
     _print(result, lambda _: text, arguments.json)
     if arguments.open:
@@ -251,6 +253,7 @@ def _compare(arguments: argparse.Namespace) -> int:
 def _calibrate(arguments: argparse.Namespace) -> None:
     from viz_estim.calibrating import calibrate
 
+    _working("fitting")
     result = calibrate(arguments.system, arguments.data, arguments.out)
     _print(result, printing.calibration_text, arguments.json)
 
@@ -270,12 +273,19 @@ def _export(arguments: argparse.Namespace) -> None:
 def _simulate(arguments: argparse.Namespace) -> None:
     from viz_estim.simulating import simulate
 
+    _working("simulating")
     for path in simulate(arguments.system, arguments.settings, arguments.seed, arguments.out):
         print(path)
 
 
 def _print(value: dict[str, Any], text: Callable[[Any], str], as_json: bool) -> None:
     print(json.dumps(printing.plain(value), allow_nan=False) if as_json else text(value))
+
+
+def _working(what: str) -> None:
+    """Says on stderr, where that is a terminal, what takes a while and cannot tell how far it is."""
+    if sys.stderr.isatty():
+        print(f"{what} …", file=sys.stderr, flush=True)
 
 
 def _progress() -> Callable[[int, int], None]:
