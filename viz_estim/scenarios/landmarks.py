@@ -102,14 +102,17 @@ def landmarks_ekf(
 ) -> Scenario:
     """An EKF on position and velocity from ranges to two landmarks, which cannot tell a place from its mirror image.
 
-    initial: where the first two ranges cross, on the `side` of the line from landmark 1 to landmark 2. accel_noise is
+    initial: where the first two ranges cross, on the `side` of the line from landmark 1 to landmark 2; or the truth,
+    where it begins. accel_noise is
     white acceleration in m/s²/√Hz, range_noise in m; a gate is the probability with which a good reading passes.
     """
     positive(accel_noise=accel_noise, range_noise=range_noise, initial_velocity_std=initial_velocity_std)
-    start = _start(data, initial, side, range_noise, initial_velocity_std)
+    beliefs = _starts(data, initial, side, range_noise, initial_velocity_std)
     # The first reading is no news to a belief that was made of it.
     ticks = [
-        Tick(float(time), float(time - data.time[max(k - 1, 0)]), measurements={"range": data.ranges[k]} if k else {})
+        Tick(float(time), 0.0)
+        if k in beliefs
+        else Tick(float(time), float(time - data.time[k - 1]), measurements={"range": data.ranges[k]})
         for k, time in enumerate(data.time)
     ]
     notes = (
@@ -122,7 +125,7 @@ def landmarks_ekf(
     scenery = Landmarks(data.landmarks, ("1", "2"))
     return Scenario(
         estimator(data.landmarks, accel_noise, range_noise, probability("gate", gate)),
-        {0: start},
+        beliefs,
         ticks,
         data.truth if np.isfinite(data.truth).any() else None,
         {"landmarks": scenery},
@@ -162,14 +165,22 @@ def _process_noise(dt: float, accel_noise: float) -> Array:
     return accel_noise**2 * np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(2))
 
 
-def _start(data: LandmarksData, initial: str, side: str, range_noise: float, velocity_std: float) -> Gaussian:
-    """The belief at step 0: the truth, or where the first ranges cross; either as sure as one pair of ranges is."""
+def _starts(
+    data: LandmarksData, initial: str, side: str, range_noise: float, velocity_std: float
+) -> dict[int, Gaussian]:
+    """The start by step: where the first ranges cross, or the truth, which sets the belief where it begins."""
+    seen = np.concatenate([_crossing(data, 1.0 if side == "left" else -1.0, range_noise), np.zeros(2)])
+    means = {0: seen}
     if initial == "truth":
-        mean = np.where(np.isfinite(data.truth[0]), data.truth[0], 0.0)
-        if not np.isfinite(data.truth[0, :2]).all():
-            raise BadInput("initial=truth needs x and y in the first row, and this data has none: use initial=ranges")
-    else:
-        mean = np.concatenate([_crossing(data, 1.0 if side == "left" else -1.0, range_noise), np.zeros(2)])
+        known = np.isfinite(data.truth[:, :2]).all(1)
+        if not known.any():
+            raise BadInput("initial=truth needs x and y, and this data has none: use initial=ranges")
+        means[int(np.argmax(known))] = np.nan_to_num(data.truth[np.argmax(known)])
+    return {k: _belief(data, mean, range_noise, velocity_std) for k, mean in means.items()}
+
+
+def _belief(data: LandmarksData, mean: Array, range_noise: float, velocity_std: float) -> Gaussian:
+    """The belief with this mean, as sure of the place as one pair of ranges is."""
     H = directions(mean[:2], data.landmarks)
     cov = np.diag([0.0, 0.0, velocity_std**2, velocity_std**2])
     # On the line itself the ranges say nothing across it: there the belief is as wide as the landmarks are apart.
