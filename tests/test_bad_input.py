@@ -84,11 +84,23 @@ BAD_COMMANDS: dict[str, tuple[list[str], str]] = {
     "no such choice": ([*RUN, "--set", "frozen=maybe"], "ignore or reject"),
     "noise of zero": ([*RUN, "--set", "gyro_noise=0"], "gyro_noise must be a positive number"),
     "negative noise": ([*RUN, "--set", "accel_noise=-1"], "accel_noise must be a positive number"),
+    "noise without bound": ([*RUN, "--set", "gyro_noise=1e300"], "gyro_noise=1e+300 is too large"),
     "negative standard deviation": ([*RUN, "--set", "initial_rate_std=-1"], "initial_rate_std"),
     "gate of one": ([*RUN, "--set", "gyro_gate=1"], "gyro_gate is a probability"),
     "gate of zero": ([*RUN, "--set", "accel_gate=0"], "accel_gate is a probability"),
     "too short a simulation": ([*RUN, "--set", "data.duration=1"], "duration"),
     "negative seed": ([*RUN, "--seed", "-1"], "--seed -1"),
+    "seed beyond all": ([*RUN, "--seed", str(2**64)], "--seed 18446744073709551616"),
+    "too long a simulation": ([*RUN, "--set", "data.duration=1e9", "--seed", "1"], "duration must be at most 3600"),
+    "too many landmarks' readings": (["run", "landmarks-ekf", *OUT, "--seed", "1", "--set=data.rate=1e12"], "readings"),
+    "too many rows": (["run", "range-ekf", *OUT, "--seed", "1", "--set=data.duration=1e12"], "at most 1e+06"),
+    "too long a flight": (
+        ["run", "quadrotor-ukf-pose", *OUT, "--seed", "1", "--set=data.duration=1e9"],
+        "at most 3600",
+    ),
+    "too many steps": (["run", "underwater-bayes", *OUT, "--seed", "1", "--set=data.steps=10000000000"], "steps"),
+    "too many points": (["run", "scan-icp", *OUT, "--seed", "1", "--set=data.points=10000000000"], "points"),
+    "too many particles": (["run", "beacons-pf", *OUT, "--set=particles=10000000000"], "at most 1e+07"),
     "seed that is no number": ([*RUN, "--seed", "x"], "--seed"),
     "--every 0": ([*RUN, "--every", "0"], "--every 0"),
     "no such folder": (["run", "imu-ukf", "--out", "{}/nowhere/a.rrd"], "does not exist"),
@@ -109,6 +121,8 @@ BAD_COMMANDS: dict[str, tuple[list[str], str]] = {
     "show: time that is no number": (["show", "{rec}", "--time", "nan"], "nan"),
     "show: step and time": (["show", "{rec}", "--step", "1", "--time", "1"], "not allowed"),
     "export: over its own recording": (["export", "{rec}", "--to", "csv", "-o", "{rec}"], "must end in .csv"),
+    "a file that leaves": (["run", "{}/leaves.py:f", *OUT], "cannot be imported (SystemExit: 3)"),
+    "no place for recordings": (["run", "parameter-ekf", "--seed", "1"], "recordings: cannot be made here"),
     "run: a calibration as data": (["run", "imu-ukf", "--data", "{}/text.json"], "expected a data file"),
     "run: no such calibration": (
         ["run", "imu-ukf", "--seed", "1", "--calibration", "{}/no.json"],
@@ -167,15 +181,26 @@ def test_bad_data_is_refused(what: str, cli: Cli, course: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize("what", BAD_COMMANDS)
 @pytest.mark.usefixtures("no_display")
-def test_bad_usage_is_refused(what: str, cli: Cli, course: Path, recording: Path, tmp_path: Path) -> None:
+def test_bad_usage_is_refused(
+    what: str, cli: Cli, course: Path, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     arguments, words = BAD_COMMANDS[what]
     for folder in ("empty", "sets", "folder.rrd"):
         (tmp_path / folder).mkdir()
     three_sets(tmp_path / "sets", course)
-    files = {"text.json": "hello", "other.json": '{"a": 1}', "list.json": "[1, 2]", "out.rrd": "precious"}
+    files = {
+        "text.json": "hello",
+        "other.json": '{"a": 1}',
+        "list.json": "[1, 2]",
+        "out.rrd": "precious",
+        "leaves.py": "raise SystemExit(3)",
+    }
     for name, content in {**files, "a.png": "precious", "a.csv": "precious", "garbage.rrd": "RRF2garbage"}.items():
         (tmp_path / name).write_text(content)
     given = [argument.format(tmp_path, rec=recording) for argument in arguments]
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "recordings").write_text("a file of that name")
+    monkeypatch.chdir(tmp_path / "here")
     assert_refused(cli, tmp_path, given, words)
 
 

@@ -238,6 +238,19 @@ def test_a_start_at_the_truth_needs_one(cli: Cli, tmp_path: Path) -> None:
     refused(cli("run", "beacons-pf", "--data", path, "--set", "initial=truth", *out), "q_groundTruth")
 
 
+def test_a_truth_that_begins_later_sets_the_belief_there(tmp_path: Path) -> None:
+    held = fields(tmp_path)
+    truth = held["q_groundTruth"].astype(float)
+    truth[:, :4] = np.nan
+    data = beacons.beacons([write(tmp_path, held | {"q_groundTruth": truth})], np.random.default_rng(0))
+    scenario = beacons.beacons_pf(data, particles=50, initial="truth")
+    assert list(scenario.beliefs) == [0, 4]
+    np.testing.assert_array_equal(scenario.beliefs[4].states, np.tile(data.log.truth[4], (50, 1)))
+    steps = list(run(scenario))
+    assert [step.tick.dt > 0 for step in steps[:6]] == [False, True, True, True, False, True]
+    assert [step.error for step in steps] == [None] * len(steps)
+
+
 def refused(done: Any, words: str) -> None:
     assert (done.code, done.out) == (2, ""), done
     assert done.err.count("\n") == 1

@@ -91,6 +91,9 @@ def test_the_clocks_offset_is_found(simulated, fits, late):
     moved = shifted.sets[0].time_offset_s - fits[2].sets[0].time_offset_s
     assert moved == pytest.approx(late, abs=5e-4)  # positive: the truth's stamps are late
     np.testing.assert_allclose(shifted.calibration.gyro_sensitivity, fits[2].calibration.gyro_sensitivity, atol=0.3)
+    for one in (shifted.sets[0], *(fit.sets[0] for fit in fits)):
+        known = late if one is shifted.sets[0] else 0.0
+        assert abs(one.time_offset_s - known) < 3.5 * one.time_offset_se
 
 
 def test_noise_in_the_reference_does_not_pull_the_gain(simulated):
@@ -185,8 +188,11 @@ def test_bad_input_is_one_line(simulated):
         "accel": np.resize(log.accel[still], log.accel.shape),
         "gyro": np.resize(log.gyro[still], log.gyro.shape),
     }
+    mirrored = log.gyro * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * 370.0]
     cases = {
         "at least one set": [],
+        "the gyro's sensitivity along z comes out as": [replace(log, gyro=mirrored)],
+        "the accel's sensitivity along x comes out as -": [replace(log, accel=log.accel * [-1, 1, 1] + [1023, 0, 0])],
         "SI units": [replace(log, in_counts=False)],
         "no motion capture": [log, replace(log, truth_stamps=np.empty(0), truth=np.empty((0, 4)))],
         "of this set": [replace(log, truth_stamps=log.truth_stamps + 1000.0)],

@@ -171,3 +171,44 @@ def test_open_without_a_display_names_what_works(cli: Cli, recording: Path) -> N
     assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
     assert "--web" in done.err
     assert "snapshot" in done.err
+
+
+@pytest.mark.parametrize(("particles", "options"), [(300, []), (300, ["--every", "7"]), (5000, [])])
+def test_show_tells_how_many_particles_there_are_and_what_they_are_worth(
+    particles: int, options: list[str], cli: Cli, tmp_path: Path
+) -> None:
+    """Also where the cloud was thinned (beyond 4000), or is kept at every N-th step only."""
+    out = tmp_path / "a.rrd"
+    settings = [f"--set={text}" for text in (f"particles={particles}", "resample_below=0.5", "data.duration=1")]
+    done = cli("run", "beacons-pf", *settings, "--seed", 2, *options, "--out", out)
+    assert (done.code, done.err) == (0, "")
+    weighed = float(particles)
+    for number in range(viz_estim.load(out).step[-1] + 1):
+        for stage in strict(cli("show", out, "--step", number, "--json"))["stages"]:
+            weighed = {"weigh": stage.get("ess"), "resample": particles}.get(stage["name"], weighed)
+            assert set(stage["belief"]) == {"particles", "ess", "mean", "cov"}
+            assert stage["belief"]["particles"] == particles
+            assert stage["belief"]["ess"] == pytest.approx(weighed)
+    assert f"{particles}, ESS " in cli("show", out, "--step", 3).out
+
+
+def test_stages_are_there_where_nothing_of_them_is_kept(cli: Cli, tmp_path: Path) -> None:
+    """The problem has five steps: of `predict`, `--every 5` keeps no cloud at all."""
+    shown = []
+    for every in (1, 5):
+        out = tmp_path / f"{every}.rrd"
+        strict(cli("run", "se2-pf", "--every", every, "--out", out, "--json"))
+        shown.append([strict(cli("show", out, "--step", step, "--json"))["stages"] for step in range(5)])
+    whole, thinned = shown
+    assert [[stage["name"] for stage in stages] for stages in thinned] == [
+        [stage["name"] for stage in stages] for stages in whole
+    ]
+    for name in ("mean", "cov"):
+        assert thinned[4][-1]["belief"][name] == whole[4][-1]["belief"][name]
+
+
+def test_a_belief_over_labels_has_no_trajectory(cli: Cli, tmp_path: Path) -> None:
+    sample = Path(__file__).parents[1] / "recordings" / "underwater-bayes-sample.rrd"
+    done = cli("export", sample, "--to", "tum", "-o", tmp_path / "a.tum")
+    assert (done.code, done.out, done.err.count("\n"), list(tmp_path.iterdir())) == (2, "", 1, [])
+    assert "use --to csv" in done.err

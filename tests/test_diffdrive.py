@@ -95,6 +95,7 @@ def test_calibrate_finds_the_documented_covariances(real_data: Path, cli: Cli, t
     data, out = real_data / "cmu16642", tmp_path / "cal.json"
     done = strict(cli("calibrate", "diffdrive", "--data", data / "calibration.mat", "--out", out, "--json"))
     np.testing.assert_array_equal(np.round(done["gps_cov"], 4), [[1.8817, 0.0632], [0.0632, 2.1384]])
+    assert (done["W"], done["V"]) == (done["gps_cov"], done["input_cov"])
     np.testing.assert_array_equal(np.round(done["input_cov"], 4), [[0.2590, 0.0010], [0.0010, 0.0625]])
     assert (done["gps_count"], done["input_count"], done["calibration"]) == (250, 2500, str(out))
     assert list(tmp_path.iterdir()) == [out]

@@ -14,6 +14,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick, run
 from viz_estim.core.spaces import Euclidean
 from viz_estim.core.stages import Update
+from viz_estim.errors import BadInput
 from viz_estim.scenarios import landmarks
 from viz_estim.scenarios.ranges import directions, distances
 
@@ -212,3 +213,16 @@ def refused(done: Any, words: str) -> None:
     assert (done.code, done.out) == (2, ""), done
     assert done.err.count("\n") == 1
     assert words in done.err
+
+
+def test_a_truth_that_begins_later_sets_the_belief_there() -> None:
+    data = landmarks.landmarks(None, np.random.default_rng(3), duration=5.0)
+    data.truth[:7, :2] = np.nan
+    scenario = landmarks.landmarks_ekf(data, initial="truth")
+    assert list(scenario.beliefs) == [0, 7]
+    np.testing.assert_array_equal(scenario.beliefs[7].mean, data.truth[7])
+    assert [k for k, tick in enumerate(scenario.ticks) if tick.dt == 0] == [0, 7]
+    assert np.hypot(*(list(run(scenario))[-1].stages[-1].belief.mean - data.truth[-1])[:2]) < 1
+    data.truth[:] = np.nan
+    with pytest.raises(BadInput, match="initial=truth needs x and y"):
+        landmarks.landmarks_ekf(data, initial="truth")

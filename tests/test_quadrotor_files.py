@@ -115,6 +115,15 @@ def test_a_flight_alone_measures_its_pose_by_motion_capture(tmp_path: Path) -> N
         quadrotor_ukf_velocity(data)
 
 
+def test_a_flight_without_motion_capture_has_a_camera(tmp_path: Path) -> None:
+    paths = [write(tmp_path / "flight.mat", {"data": flight()["data"]}), write(tmp_path / "camera.mat", camera())]
+    data = read(*paths)
+    assert np.isfinite(data.pose).all(1).sum() == T // 2
+    assert np.isnan(data.truth).all()
+    assert "nothing tells the truth" in data.notes
+    assert [step.error for step in run(quadrotor_ukf_pose(data))] == [None] * T
+
+
 def test_a_camera_s_readings_come_with_the_imu_s_next_sample(tmp_path: Path) -> None:
     late = camera()
     late["time"] = late["time"] + 0.004
@@ -166,6 +175,7 @@ FIELDS: dict[str, dict[str, dict[str, Any]]] = {  # by kind of file: what stands
         "NaN in position": {"position": spoilt(C["position"])}, "NaN": {"linearVel": spoilt(C["linearVel"])},
         "time goes back": {"time": -C["time"]}, "NaN in time": {"time": spoilt(C["time"])}, "text": {"angle": "abc"},
         "few": {name: values[:5] for name, values in C.items()}, "none": {name: v[:0] for name, v in C.items()},
+        "a pose in 0.4 s": {"time": 20 * C["time"]},
         "nothing known": dict.fromkeys(["position", "linearVel", "angVel"]),
     },
     "flight": {

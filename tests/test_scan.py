@@ -151,6 +151,10 @@ TEXTS: dict[str, Callable[[], tuple[str, int]]] = {
     "header": lambda: (text(cloud(), ",", "x,y,z,nx", more=",1"), 3),
     "header of capitals, quoted": lambda: (text(cloud(), ",", '"X", "Y", "Z"'), 3),
     "header of a comment": lambda: ("# made by hand\n" + text(cloud(), " ", "//X Y Z"), 3),
+    "header with units": lambda: (text(cloud(), ",", "x [m], y (m), z [m]"), 3),
+    "semicolons": lambda: (text(cloud(), ";", "x;y;z"), 3),
+    "how many there are": lambda: (f"{len(cloud())}\n" + text(cloud(), " "), 3),
+    "comments of MATLAB": lambda: ("% made by hand\n" + text(cloud(), " "), 3),
     "header in another order": lambda: (text(cloud()[:, [2, 0, 1]], ",", "time,z,x,y").replace("\n", "\n7,", 9), 3),
     "comments": lambda: ("# made by hand\n" + text(cloud(), " ") + "\n# the end\n", 3),
     "byte order mark and CR": lambda: ("\ufeff" + text(cloud(), ",", "x,y,z").replace("\n", "\r\n"), 3),
@@ -287,6 +291,7 @@ BAD_FILES: dict[str, tuple[str | bytes, str]] = {
     ),
     "ply: an unknown type": (BINARY.replace(b"float x", b"half x"), "a line of no known form: 'property half x'"),
     "ply: no number": (BINARY.replace(b"vertex 9", b"vertex many"), "'element vertex many'"),
+    "ply: less than none": (ply(cloud(), "ascii").replace(b"vertex 9", b"vertex -9"), "'element vertex -9'"),
     "ply: NaN": (ply(cloud() * np.nan, "binary_big_endian"), "x of point 0 is nan"),
     "ply: a word": (ply(cloud(), "ascii").replace(b"\n3 0 1 2", b" 1\n3 0 1 2"), "vertex 8 has 6 numbers"),
 }

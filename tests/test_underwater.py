@@ -227,8 +227,9 @@ BAD_FILES = {
     "a text for a reading": (HEADER + "0,yes,0,clear\n", "line 2, sonar: 'yes' is not a number"),
     "infinite stamp": (HEADER + ROWS + "inf,0,0,clear\n", "line 5, time: 'inf' is not finite"),
     "stamps that go back": (HEADER + ROWS + "1,0,0,clear\n", "line 5, time goes back"),
-    "a blank line": (HEADER + "0,0,0,clear\n\n1,0,0,clear\n", "line 3 has 1 cells"),
-    "no table": ("hello " * 1000, "missing time, sonar, flow"),
+    "behind a blank line": (HEADER + "0,0,0,clear\n\n1,0,0\n", "line 4 has 3 cells"),
+    "no table": ("hello " * 1000, "column names alone"),
+    "a table of other things": ("a,b\n1,2\n", "missing time, sonar, flow"),
 }
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from viz_estim import diagnosing, printing
+import numpy as np
+
+from viz_estim import diagnosing, printing, progress
 from viz_estim.debugger import commands as debugging
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable
@@ -23,7 +24,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         arguments = _parser().parse_args(argv)
         command: Callable[[argparse.Namespace], int | None] = arguments.command
-        return command(arguments) or 0
+        with np.errstate(over="ignore"):  # what overflows is infinite, and the run ends where that is seen
+            return command(arguments) or 0
     except _Usage as error:
         return _refuse(str(error))
     except BadInput as error:
@@ -34,6 +36,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _refuse(f"{where}{error.strerror or error}")
+    except MemoryError as error:
+        return _refuse(f"not enough memory ({error or 'out of memory'}); ask for less: fewer particles, a shorter run")
     except KeyboardInterrupt:
         return _refuse("interrupted; what was recorded so far is in the .partial.rrd file", 130)
     except RuntimeError as error:
@@ -101,7 +105,7 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--open", action="store_true", help="open the recording when it is done")
     _json(p)
     diagnosing.add(command)
-    debugging.add(command, _inputs, _progress)
+    debugging.add(command, _inputs, progress.counter)
     p = command("calibrate", _calibrate, "fit sensor constants or noise covariances to ground truth")
     p.add_argument("system", choices=["imu", "diffdrive"], metavar="imu|diffdrive")
     p.add_argument("--data", type=Path, action="append", required=True, metavar="PATH")
@@ -173,7 +177,7 @@ def _run(arguments: argparse.Namespace) -> None:
         arguments.out,
         every=arguments.every,
         live=viewer.url if viewer else None,
-        progress=_progress(),
+        progress=progress.counter(),
     )
     if viewer:
         viewer.detach()
@@ -209,6 +213,7 @@ def _snapshot(arguments: argparse.Namespace) -> None:
     except NotARun:  # such as a calibration's picture: the viewer knows its moments
         given = {"step": arguments.step, "time": arguments.time, "stage": arguments.stage}
         timeline, value = next(((name, v) for name, v in given.items() if v is not None), ("time", None))
+    progress.working("drawing")
     try:
         problems = snapshot(arguments.file, arguments.out, timeline=timeline, value=value, size=arguments.size)
     except ViewerError as error:
@@ -236,6 +241,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     from viz_estim.compare import compare
     from viz_estim.recording.viewer import open_files
 
+    progress.working("comparing")
     result, text = compare(arguments.files, arguments.out, arguments.tol)
     _print(result, lambda _: text, arguments.json)
     if arguments.open:
@@ -246,6 +252,7 @@ def _compare(arguments: argparse.Namespace) -> int:
 def _calibrate(arguments: argparse.Namespace) -> None:
     from viz_estim.calibrating import calibrate
 
+    progress.working("fitting")
     result = calibrate(arguments.system, arguments.data, arguments.out)
     _print(result, printing.calibration_text, arguments.json)
 
@@ -265,24 +272,10 @@ def _export(arguments: argparse.Namespace) -> None:
 def _simulate(arguments: argparse.Namespace) -> None:
     from viz_estim.simulating import simulate
 
+    progress.working("simulating")
     for path in simulate(arguments.system, arguments.settings, arguments.seed, arguments.out):
         print(path)
 
 
 def _print(value: dict[str, Any], text: Callable[[Any], str], as_json: bool) -> None:
     print(json.dumps(printing.plain(value), allow_nan=False) if as_json else text(value))
-
-
-def _progress() -> Callable[[int, int], None]:
-    """Shows a count on stderr, where that is a terminal, five times a second."""
-    if not sys.stderr.isatty():
-        return lambda done, total: None
-    last = time.monotonic()
-
-    def show(done: int, total: int) -> None:
-        nonlocal last
-        if done == total or time.monotonic() - last > 0.2:
-            last = time.monotonic()
-            print(f"\r{done}/{total} steps", end="\n" if done == total else "", file=sys.stderr, flush=True)
-
-    return show

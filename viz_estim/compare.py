@@ -11,7 +11,7 @@ from typing import Any
 from viz_estim import comparison_table
 from viz_estim.differences import Difference, first_difference, other_data
 from viz_estim.errors import BadInput
-from viz_estim.files import check_writable
+from viz_estim.files import check_writable, make_folder
 from viz_estim.recording import merged, schema
 from viz_estim.recording.compared import COLOURS, Compared, light
 from viz_estim.recording.links import link
@@ -82,7 +82,7 @@ def _target(paths: list[Path], out: Path | None, names: list[str]) -> Path:
     if out is None:
         words = "-".join(re.sub(r"[^\w.-]+", "-", name) for name in names)
         out = Path("recordings") / (f"compare-{words[:120]}.rrd")
-        out.parent.mkdir(exist_ok=True)
+        make_folder(out.parent)
     check_writable(out, suffix=".rrd")
     if any(path.exists() and out.exists() and path.samefile(out) for path in paths):
         raise BadInput(f"{out}: is one of the recordings to compare; choose another --out")

@@ -32,6 +32,14 @@ def check_writable(path: Path, *, suffix: str | None = None) -> None:
         raise BadInput(f"{path}: cannot be written ({error.strerror}); choose another place") from error
 
 
+def make_folder(folder: Path) -> None:
+    """Makes the folder for outputs that nobody named; BadInput where that cannot be."""
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"{folder}: cannot be made here ({error.strerror}); name another place with --out") from error
+
+
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A name to write to, which becomes `path` when the context ends well and vanishes when it does not."""

@@ -64,6 +64,12 @@ def assign(
     return values, data_values
 
 
+def check_seed(seed: int | None) -> None:
+    """BadInput where it is none that a generator takes."""
+    if seed is not None and not 0 <= seed < 2**63:
+        raise BadInput(f"--seed {seed}: expected a whole number from 0 on, below 2⁶³")
+
+
 def nearest(name: str, names: Iterable[str]) -> str:
     """ "; did you mean X?", or the names there are."""
     known = list(names)

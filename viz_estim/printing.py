@@ -159,7 +159,28 @@ def _belief(run: Run, table: StageTable, at: int) -> dict[str, Any]:
     if run.labels:
         p = np.exp(table.values["log_probabilities"][at])
         return {"probabilities": dict(zip(run.labels, p, strict=True))}
-    return {"mean": table.mean[at], "cov": table.cov[at]}
+    moments = {"mean": table.mean[at], "cov": table.cov[at]}
+    count = int(run.properties.get("particles", {}).get("count", 0))
+    return {"particles": count, "ess": _ess(run, table, at, count)} | moments if count else moments
+
+
+def _ess(run: Run, table: StageTable, at: int, count: int) -> float:
+    """The effective sample size of a stage's cloud: by its weights, or, where they were thinned, by what was noted.
+
+    A cloud is resampled to equal weights, weighing notes what it leaves, and a prediction changes no weight.
+    """
+    found: tuple[StageTable, int] | None = (table, at)
+    while found is not None:
+        values, row = found[0].values, found[1]
+        log_weights = values["log_weights"][row] if "log_weights" in values else np.empty(0)
+        if len(log_weights) == count and np.isfinite(log_weights).all():
+            return float(1 / np.square(np.exp(log_weights)).sum())
+        if "distinct" in values:
+            break
+        if "ess" in values:
+            return float(values["ess"][row])
+        found = run.before(*found)
+    return float(count)
 
 
 def _moved(run: Run, table: StageTable, at: int) -> dict[str, Any]:
@@ -186,6 +207,8 @@ def step_text(run: Run, value: dict[str, Any]) -> str:
             lines.append(f"  {'probability':18} {_named(run.labels, p.values(), ('',) * len(p))}")
         else:
             mean, cov = stage["belief"]["mean"], stage["belief"]["cov"]
+            if "particles" in stage["belief"]:
+                lines.append(f"  {'particles':18} {stage['belief']['particles']}, ESS {stage['belief']['ess']:.5g}")
             lines.append(f"  {'mean':18} {_named(run.space.names, mean, run.space.units)}")
             sigma = np.sqrt(np.maximum(np.diagonal(cov), 0))
             lines.append(f"  {'σ':18} {_named(run.space.axes, sigma, run.space.axis_units)}")
@@ -272,4 +295,6 @@ def _row(values: Any) -> str:
 
 
 def _short(value: Any) -> str:
+    if value is None or isinstance(value, bool):  # as `--set` takes them
+        return "none" if value is None else "yes" if value else "no"
     return f"{value:.5g}" if isinstance(value, (float, np.floating)) else str(value)

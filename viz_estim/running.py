@@ -19,8 +19,8 @@ import numpy as np
 from viz_estim.core.consistency import Tally
 from viz_estim.core.run import Scenario, Step, run
 from viz_estim.errors import BadInput
-from viz_estim.files import check_writable, sha256
-from viz_estim.parameters import assign, nearest, parameters
+from viz_estim.files import check_writable, make_folder, sha256
+from viz_estim.parameters import assign, check_seed, nearest, parameters
 from viz_estim.recording.recorder import Recorder
 from viz_estim.scenarios import SCENARIOS, SYSTEMS
 
@@ -115,8 +115,7 @@ def plan(
     takes_calibration = source.data is not None and "calibration" in inspect.signature(source.data).parameters
     if calibration and not takes_calibration:
         raise BadInput(f"{name}: takes no --calibration")
-    if seed is not None and seed < 0:
-        raise BadInput(f"--seed {seed}: expected a whole number from 0 on")
+    check_seed(seed)
     data_parameters = parameters(source.data) if source.data else {}
     params, data_params = assign(settings, parameters(source.scenario), data_parameters, name)
     if source.data and not data and seed is None and source.system:
@@ -170,7 +169,7 @@ def _import(path: Path) -> Any:
     sys.path.insert(0, str(path.parent.resolve()))
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise BadInput(f"{path}: cannot be imported ({type(error).__name__}: {error})") from error
     finally:
         sys.path.pop(0)
@@ -234,7 +233,7 @@ def execute(planned: Plan, out: Path | None, *, every: int, live: str | None, pr
     scenario = planned.build()
     path = out or Path("recordings") / f"{planned.title()}.rrd"
     if out is None:
-        path.parent.mkdir(exist_ok=True)
+        make_folder(path.parent)
     check_writable(path, suffix=".rrd")
     properties = planned.properties(scenario)
     with Recorder(path, scenario, properties, every=every, live=live) as recorder:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 
 from viz_estim.errors import BadInput
-from viz_estim.parameters import assign, nearest, parameters
+from viz_estim.parameters import assign, check_seed, nearest, parameters
 from viz_estim.scenarios import SYSTEMS
 
 
@@ -15,8 +16,7 @@ def simulate(system: str, settings: list[str], seed: int, folder: Path) -> list[
     """Simulates a system with `K=V` settings; the files that were written."""
     if system not in SYSTEMS:
         raise BadInput(f"no system {system}{nearest(system, SYSTEMS)}")
-    if seed < 0:
-        raise BadInput(f"--seed {seed}: expected a whole number from 0 on")
+    check_seed(seed)
     module = SYSTEMS[system]
     make = getattr(module, system)
     # Here every parameter is the data's: `freeze=0` and `data.freeze=0` mean the same.
@@ -26,5 +26,7 @@ def simulate(system: str, settings: list[str], seed: int, folder: Path) -> list[
     if folder.exists() and not folder.is_dir():
         raise BadInput(f"{folder}: is a file, expected a folder")
     folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise BadInput(f"{folder}: nothing can be written there (permission denied); choose another folder")
     written: list[Path] = module.save(data, folder)
     return written

@@ -22,12 +22,14 @@ def build(layout: Layout) -> rrb.Blueprint:
     scenes = _scenes(layout)
     figures = _figures(layout)
     tabs = [_probabilities()] if layout.labels else [*_health(layout), _state(layout), *_moved(layout)]
-    tabs = [*figures, *tabs] if figures and not layout.true_parts else [*tabs[:1], *figures, *tabs[1:]]
+    tabs = (
+        [*figures, *tabs] if figures and (layout.matched or not layout.true_parts) else [*tabs[:1], *figures, *tabs[1:]]
+    )
     plots = rrb.Tabs(*tabs, name="plots", active_tab=0)
     lanes = rrb.StateTimelineView(origin=schema.LANES, name="Lanes: stage, and what became of each sensor's reading")
     notes = rrb.TextDocumentView(origin=schema.NOTES, name="What to look at")
     left: list[_Item] = [*scenes, notes]
-    shares: list[float] = {1: [1.0], 2: [3.0, 1.0], 3: [3.0, 2.0, 1.6]}[len(left)]
+    shares: list[float] = {1: [1.0], 2: [2.6, 1.0], 3: [3.0, 2.0, 1.6]}[len(left)]
     if layout.camera:
         shares = [2.3, 2.4, 1.6]  # the unrolled sphere is twice as wide as high
     low = min(0.4, 0.054 + 0.044 * (len(layout.inputs) + 1 + bool(layout.labels)))  # a lane is some 37 pixels high
@@ -42,6 +44,25 @@ def build(layout: Layout) -> rrb.Blueprint:
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
+
+
+def legend(layout: Layout) -> str:
+    """What the colours of this recording mean, as markdown."""
+    if layout.labels:
+        said = "each label has its own, in the bars, over time and in the lane of the truth"
+    else:
+        truth = ", white the truth" if layout.true_parts else ""
+        what = "the moved cloud and its pose" if layout.matched else "the estimate"
+        said = f"amber is {what}{truth}, grey lines its bounds"
+        if layout.particles:
+            said += ", yellow each of several modes"
+        if layout.matched:
+            said += ", grey points the fixed cloud"
+        elif layout.attitude:
+            said += ", each sensor has its own; red, green and blue are the axes x, y, z"
+        elif not layout.particles:
+            said += ", each sensor has its own"
+    return f"**Colours:** {said}. On the `stage` timeline each stage shows what it alone drew."
 
 
 def _scenes(layout: Layout) -> list[_Item]:
@@ -63,7 +84,7 @@ def _scenes(layout: Layout) -> list[_Item]:
         kind = "Plan from above" if layout.planar else "World"
         title = f"estimate amber with 3σ{truth}, before the update grey"
         if layout.particles:
-            title = f"particles blue (light) to amber (heavy){truth}"
+            title = f"particles blue (light) to amber (heavy), modes yellow{truth}"
         elif layout.matched:
             title = "moved cloud amber, fixed grey, pairs blue (near) to red (far)"
         first.append(_world(layout, f"{kind} [m]: {title}"))
@@ -124,8 +145,9 @@ def _health(layout: Layout) -> list[_Item]:
                 for i, axis in enumerate(part.axes)
             ]
             errors += _rows(views)
+    what = " innov." if len(layout.sensors) < 4 else ""  # four in a row leave no place for the word
     views = [
-        _plot("innovation", f"{name}.{axis}", f"{_titled(name, axis)} innov.{_unit(space, i)} ±3σ")
+        _plot("innovation", f"{name}.{axis}", f"{_titled(name, axis)}{what}{_unit(space, i)} ±3σ")
         for name, space in layout.sensors.items()
         for i, axis in enumerate(space.axes)
     ]

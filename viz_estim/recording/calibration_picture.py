@@ -19,7 +19,7 @@ Series = Any  # time s (T,); accel_deg (T, 2), gyro_deg, truth_deg (T, 3); accel
 
 # Drawn in this order: the truth is a broad line under the two that are compared with it.
 _NAMES = ("motion capture", "documented constants", "fitted constants")
-_COLOURS = (schema.TRUTH, (190, 100, 50), schema.ESTIMATE)
+_COLOURS = (schema.TRUTH, (90, 150, 220), schema.ESTIMATE)
 _WIDTHS = (3.5, 2.0, 1.0)
 _PLOTS = (
     {f"gravity/{a}": f"{a.capitalize()} from gravity [deg]" for a in ("roll", "pitch", "error")},

@@ -90,7 +90,7 @@ class Recorder:
         kind |= {"labels": list(belief.labels)} if self._layout.labels else {"space": describe(scenario.space)}
         self._properties = dict(properties) | kind
         self._send_properties()
-        notes = f"{scenario.notes}\n\n{schema.LEGEND}".strip()
+        notes = f"{scenario.notes}\n\n{blueprints.legend(self._layout)}".strip()
         send_static(self._stream, schema.NOTES, rr.TextDocument(notes, media_type="text/markdown"))
         self._patience = _SECONDS_WATCHED if live else _SECONDS
         self._oldest = 0.0  # when the first of the buffered rows came

@@ -35,11 +35,6 @@ HEALTH: dict[str, Colour] = {
 
 _MORE: tuple[Colour, ...] = ((230, 200, 60), (200, 110, 220), (60, 200, 200))
 
-LEGEND = (
-    "**Colours:** amber is the estimate, white the truth, grey lines its bounds, each sensor has its own; red, green "
-    "and blue are the x, y and z axes. On the `stage` timeline each stage shows what it alone drew."
-)
-
 STEPS = "/steps"
 NOTES = "/notes"
 EVENTS = "/events"

@@ -38,7 +38,8 @@ def stage_columns(layout: Layout, batch: Batch, rows: StageRows, every: int) -> 
             columns += (_indices if field == "ancestors" else _thinned)(rows, field, kept)
         elif "shape" in what:
             columns.append(_column(rows, field))
-    return columns
+    # A stage has its rows also where nothing of them is kept.
+    return columns or [numbers(_STAGE, "log_weights", [None] * len(kept))]
 
 
 def _own(rows: StageRows, field: str, what: dict[str, list[str]] | None, kept: np.ndarray) -> np.ndarray:

@@ -135,7 +135,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
         """Name, class (`3D`, `TimeSeries`, …) and visibility of each view of the blueprint in front."""
         return [(view.name, view.view_class, view.visible) for view in self._state().views]
 
-    def snapshot(self, path: str | Path, settle: float = 10.0) -> bool:
+    def snapshot(self, path: str | Path, settle: float = 30.0) -> bool:
         """Writes the whole viewer as a PNG, whole or not at all; False if it still changed after `settle` seconds."""
         png, path, part = b"", Path(path), Path(f"{path}.{os.getpid()}.part")
         equal = 0

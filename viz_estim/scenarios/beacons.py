@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.stats import qmc
 
+from viz_estim.core.beliefs import Particles
 from viz_estim.core.particle import ParticleFilter, equal
 from viz_estim.core.quaternions import Array
 from viz_estim.core.resampling import Method
@@ -21,7 +22,7 @@ from viz_estim.core.scenery import Box, Landmarks
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import beacons_files
 from viz_estim.scenarios.beacons_files import PERIOD, BeaconLog
-from viz_estim.scenarios.checks import positive
+from viz_estim.scenarios.checks import at_most, positive
 from viz_estim.scenarios.diffdrive_model import SPACE, moved, path
 from viz_estim.scenarios.ranges import distances
 
@@ -89,12 +90,13 @@ def beacons_pf(
     """A particle filter on position and heading from an unknown start: ranges to two beacons leave a mirror image.
 
     Noises are standard deviations in m, m/s and rad/s at each step, wider than those of the file (0.51, 0.10, 0.09).
-    initial: particles all over the area, or all of them at the truth. Resampled where the effective sample size is
-    below the fraction resample_below of the particles; at 1 always.
+    initial: particles all over the area, or all of them at the truth, where it begins. Resampled where the effective
+    sample size is below the fraction resample_below of the particles; at 1 always.
     """
     positive(range_noise=range_noise, speed_noise=speed_noise, turn_noise=turn_noise)
     if particles < 1:
         raise BadInput(f"particles must be at least 1, got {particles}")
+    at_most(1e7, particles=particles)
     if not 0 < resample_below <= 1:
         raise BadInput(f"resample_below is a fraction above 0 and up to 1, got {resample_below:g}")
     log = data.log
@@ -115,10 +117,11 @@ def beacons_pf(
         total = -0.5 / range_noise**2 * (off[0] ** 2 + off[1] ** 2)
         return total - 2 * np.log(range_noise * np.sqrt(2 * np.pi))
 
+    beliefs = _starts(data, particles, initial)
     ticks = [
         Tick(
             float(time),
-            float(time - log.time[k - 1]) if k else 0.0,
+            0.0 if k in beliefs else float(time - log.time[k - 1]),
             log.inputs[k - 1] if k else None,
             {sensor: log.ranges[k, i : i + 1] for i, sensor in enumerate(_SENSORS)},
         )
@@ -126,7 +129,7 @@ def beacons_pf(
     ]
     return Scenario(
         ParticleFilter(propagate, log_likelihood, resampling, resample_below),
-        {0: equal(SPACE, _start(data, particles, initial))},
+        beliefs,
         ticks,
         log.truth,
         {"body": _BODY, "beacons": Landmarks(BEACONS, ("1", "2"))},
@@ -134,12 +137,20 @@ def beacons_pf(
     )
 
 
-def _start(data: BeaconData, particles: int, initial: Initial) -> Array:
-    """The particles (N, 3) at step 0."""
+def _starts(data: BeaconData, particles: int, initial: Initial) -> dict[int, Particles]:
+    """The start by step. A truth that begins later sets the belief there."""
+    starts = {0: equal(SPACE, _anywhere(data, particles))}
     if initial == "truth":
-        if not np.isfinite(data.log.truth[0]).all():
-            raise BadInput("initial=truth needs `q_groundTruth` at step 0, and this data has none: use initial=unknown")
-        return np.tile(data.log.truth[0], (particles, 1))
+        known = np.isfinite(data.log.truth).all(1)
+        if not known.any():
+            raise BadInput("initial=truth needs `q_groundTruth`, and this data has none: use initial=unknown")
+        first = int(np.argmax(known))
+        starts[first] = equal(SPACE, np.tile(data.log.truth[first], (particles, 1)))
+    return starts
+
+
+def _anywhere(data: BeaconData, particles: int) -> Array:
+    """Particles (N, 3) all over the area."""
     # Scrambled Sobol points: each is uniform, but no corner is left out by chance. Independent ones lose the true mode
     # in 12 of 100 seeds on the course's file, these in 3. They are made by powers of two.
     sobol = qmc.Sobol(3, seed=np.random.default_rng(data.seed))
@@ -151,14 +162,11 @@ def _notes(particles: int) -> str:
     dense = particles / (_AREA.prod() * 2 * np.pi)
     return (
         "The start is unknown. **Step 0**: two ranges leave two places, mirrored at the line through the beacons, and "
-        "every heading. After some 10 steps the headings have sorted themselves out and **two clouds drive towards "
-        "that line**, one of them the mirror image. Their mean lies between them, where nobody is: look at the cloud. "
-        "Where they meet at the line, both give the right ranges; beyond it each has to bend its own way, and **the "
-        "turn decides**: the image would have to turn right where the inputs say left, and its weights die out.\n\n"
-        f"**Why the noise is widened.** {particles} particles are {dense:.1g} to a square metre and radian, and "
-        "resampling keeps only those that the first readings happen to favour. With the true noises "
-        "(`range_noise=0.51 speed_noise=0.105 turn_noise=0.09`) each step moves a particle by 1 cm and half a degree: "
-        "copies stay copies, the few ancestors that are left lie beside the truth, and whichever image has the better "
-        "ones takes all. Watch the distinct ancestors at the first resamplings and the evidence, which falls when the "
-        "true mode is lost. `particles=20000` keeps it; so does wider noise, at the price of a broader cloud."
+        "every heading. After some 10 steps **two clouds drive towards that line**, one the mirror image. Their "
+        "mean lies between them, where nobody is. Beyond the line **the turn decides**: the image would have to turn "
+        "right where the inputs say left, and its weights die out.\n\n"
+        f"**Why the noise is widened.** {particles} particles are {dense:.1g} to a square metre and radian. With the "
+        "true noises (`range_noise=0.51 speed_noise=0.105 turn_noise=0.09`) copies stay copies: whichever image has "
+        "the better few ancestors takes all. The tab *Figures* has the ancestors and the evidence, which falls when "
+        "the true mode is lost. `particles=20000` keeps it; so does wider noise, at the price of a broader cloud."
     )

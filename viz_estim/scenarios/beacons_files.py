@@ -18,7 +18,7 @@ import scipy.io
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import wrap
 from viz_estim.errors import BadInput
-from viz_estim.scenarios.reading import expand, field, finite, read_mat, shape_text
+from viz_estim.scenarios.reading import expand, field, finite, mat_shapes, not_read, read_mat, shape_text
 
 PERIOD = 0.1  # s: the course's step
 _SUFFIXES = (".mat",)
@@ -44,7 +44,7 @@ def find(paths: list[Path]) -> Path:
     found = [file for path in paths for file in expand(path, _SUFFIXES) if file in paths or _fits(file)]
     where = ", ".join(map(str, paths))
     if not found:
-        raise BadInput(f"{where}: no file of ranges to two beacons there ({_WHAT})")
+        raise BadInput(f"{where}: no file of ranges to two beacons there ({_WHAT}){not_read(paths)}")
     if len(found) > 1:
         raise BadInput(f"{len(found)} files of ranges found, a run takes one: name one of {', '.join(map(str, found))}")
     if found[0].suffix.lower() not in _SUFFIXES:
@@ -80,8 +80,8 @@ def save(path: Path, log: BeaconLog) -> list[Path]:
 
 def _fits(path: Path) -> bool:
     try:
-        shapes = {name.lower(): shape for name, shape, _ in scipy.io.whosmat(path)}
-    except Exception:  # scipy raises whatever a damaged file makes it trip over; nobody named this one
+        shapes = {name.lower(): shape for name, shape in mat_shapes(path).items()}
+    except BadInput:  # nobody named this one
         return False
     return "t_y" not in shapes and "u" in shapes and shapes["u"] == shapes.get("y") and shapes["u"][0] == 2
 

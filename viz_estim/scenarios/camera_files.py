@@ -17,7 +17,7 @@ from viz_estim.core.panoramas import Picture
 from viz_estim.core.quaternions import Array
 from viz_estim.errors import BadInput
 from viz_estim.scenarios.imu_files import find_sets
-from viz_estim.scenarios.reading import expand, field, finite, read_mat, shape_text, spelled
+from viz_estim.scenarios.reading import expand, field, finite, mat_shapes, not_read, read_mat, shape_text, spelled
 
 _SUFFIXES = (".mat", ".csv", ".npz")
 _ROLES = ("cam", "panorama")  # named as the field that tells it
@@ -51,7 +51,7 @@ def find(paths: list[Path]) -> Found:
     imu, truth = sets[0]
     camera, panorama = (_of_set(imu, role, given[role]) for role in _ROLES)
     if camera is None:
-        raise BadInput(f"{where}: no camera file there (a .mat with `cam`, M×N×3×K, and `ts`)")
+        raise BadInput(f"{where}: no camera file there (a .mat with `cam`, M×N×3×K, and `ts`){not_read(paths)}")
     return Found(imu, truth, camera, panorama)
 
 
@@ -102,8 +102,8 @@ def _role(path: Path) -> str | None:
     if path.suffix.lower() != ".mat":
         return None
     try:
-        held = dict.fromkeys(name for name, *_ in scipy.io.whosmat(path))
-    except Exception:  # scipy raises whatever a damaged file makes it trip over; who needs the file will say so
+        held = mat_shapes(path)
+    except BadInput:  # who needs the file will say so
         return None
     return next((role for role in _ROLES if spelled(held, role)), None)
 

@@ -52,6 +52,8 @@ class Fit:
             "system": "diffdrive",
             "model": "x' = x + T (v cos h, v sin h, w), noise of input_cov on (v, w); y = (x, y) + noise of gps_cov",
             **{key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in found.items()},
+            "V": self.inputs.cov.tolist(),  # as the course names them
+            "W": self.gps.cov.tolist(),
             "documented": {name: value.tolist() for name, value in vars(DOCUMENTED).items()},
             "files": [{"name": path.name, "sha256": sha256(path)} for path in self.files],
         }

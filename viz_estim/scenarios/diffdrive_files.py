@@ -17,7 +17,7 @@ import scipy.io
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import wrap
 from viz_estim.errors import BadInput
-from viz_estim.scenarios.reading import expand, field, finite, read_mat, shape_text, spelled
+from viz_estim.scenarios.reading import expand, field, finite, mat_shapes, not_read, read_mat, shape_text, spelled
 
 PERIOD = 0.01  # s: the course's step
 _NEEDED = ("u", "y", "t_y")
@@ -50,7 +50,8 @@ def find(paths: list[Path]) -> list[Path]:
         found += [file for file in expand(path, _SUFFIXES) if file == path or _fits(file)]
     if not found:
         where = ", ".join(map(str, paths))
-        raise BadInput(f"{where}: no file of a differential drive there (a .mat with {_listed(_NEEDED)})")
+        what = f"a .mat with {_listed(_NEEDED)}"
+        raise BadInput(f"{where}: no file of a differential drive there ({what}){not_read(paths)}")
     return list(dict.fromkeys(found))
 
 
@@ -84,8 +85,8 @@ def save(folder: Path, name: str, log: DriveLog) -> list[Path]:
 
 def _fits(path: Path) -> bool:
     try:
-        held = {name.lower() for name, *_ in scipy.io.whosmat(path)}
-    except Exception:  # scipy raises whatever a damaged file makes it trip over; nobody named this one
+        held = {name.lower() for name in mat_shapes(path)}
+    except BadInput:  # nobody named this one
         return False
     return held >= set(_NEEDED)
 

@@ -23,7 +23,7 @@ from viz_estim.core.stages import Predict, Stage
 from viz_estim.core.unscented import UnscentedFilter, symmetric
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import imu_files, imu_fit, imu_simulation
-from viz_estim.scenarios.checks import positive, probability
+from viz_estim.scenarios.checks import at_most, positive, probability
 from viz_estim.scenarios.imu_data import ImuData, prepare
 from viz_estim.scenarios.imu_health import GRAVITY
 
@@ -36,6 +36,7 @@ Frozen = Literal["ignore", "reject"]
 _UNSEEN_RATE_WALK = 3.0  # rad/s/√s
 _STAND_IN = StandIn(np.zeros(3), 0.3**2 * np.eye(3))
 _UP = np.array([0.0, 0.0, 1.0])
+_LONGEST = 3600.0  # s that are simulated
 _BODY = Box((0.9, 0.6, 0.2))
 _RATE = Euclidean(("x", "y", "z"), "rad/s")
 
@@ -57,6 +58,7 @@ def imu(
             names = ", ".join(str(file.name) for file, _ in sets)
             raise BadInput(f"{len(sets)} IMU files found, a run takes one: name one of {names}")
         return prepare(imu_files.load(*sets[0]), calibration)
+    at_most(_LONGEST, duration=duration)
     if duration < still + max(2.0, freeze + 0.5) or min(still, freeze, noise_scale) < 0:
         raise BadInput(
             "a simulation needs duration ≥ still + 2 s and ≥ still + freeze + 0.5 s, none of them negative: "

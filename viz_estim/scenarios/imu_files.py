@@ -3,6 +3,7 @@
 The ESE 650 course's format: `imuRaw*.mat` (`vals` 6×T 10-bit counts in the order ax, ay, az, wz, wx, wy; `ts` 1×T,
 Unix s) and `viconRot*.mat` (`rots` 3×3×N body → world; `ts` 1×N). Any other log: CSV or NPZ with `time` [s],
 `gyro_x…z` [rad/s], `accel_x…z` [m/s²] and optionally `qw, qx, qy, qz` (body → world; NaN where there is no truth).
+Names in any case.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.io
@@ -17,12 +19,15 @@ import scipy.io
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.errors import BadInput
-from viz_estim.scenarios.reading import expand, field, finite, read_columns, read_mat, shape_text, unreadable
+from viz_estim.scenarios.reading import expand, field, finite, mat_shapes, not_read, read_mat, shape_text, spelled
+from viz_estim.scenarios.tables import Table, read_table
 
 _CHANNELS = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _GYRO_ROWS = [4, 5, 3]  # of `vals`: x, y, z
 _SUFFIXES = (".mat", ".csv", ".npz")
+_STAMPS = ("ts", "time", "t", "timestamp", "timestamps")  # other people's names for them
+_SLOWEST = 1.0  # s between samples: no IMU is slower, so such stamps are in another unit
 
 
 @dataclass(frozen=True)
@@ -50,21 +55,31 @@ def find_sets(paths: list[Path]) -> list[tuple[Path, Path | None]]:
     truths = [file for file, role in roles.items() if role == "truth"]
     where = ", ".join(map(str, paths))
     if not imus:
-        raise BadInput(f"{where}: no IMU file there (a .mat with `vals` and `ts`, or a .csv/.npz log with `time`)")
+        what = "a .mat with `vals` and `ts`, or a .csv/.npz log with `time`"
+        raise BadInput(f"{where}: no IMU file there ({what}){not_read(paths)}")
     if len(imus) == 1 and len(truths) == 1:
         return [(imus[0], truths[0])]
     return [(imu, _truth_of(imu, truths)) for imu in imus]
+
+
+def of_course(name: str | Path | int) -> Path:
+    """The IMU file that is meant: by its path, with or without `.mat`, or by its number, here or in `imu/`."""
+    given = f"imuRaw{name}" if isinstance(name, (int, np.integer)) else str(name)
+    wanted = [Path(given), Path(f"{given}.mat"), Path("imu", f"{given}.mat")]
+    found = next((path for path in wanted if path.is_file()), None)
+    if found is None:
+        raise BadInput(f"{given}: no such file; looked for {', '.join(map(str, wanted))} in {Path.cwd()}")
+    return found
 
 
 def load(imu: Path, truth: Path | None) -> ImuLog:
     """The IMU file read and checked, with its reference."""
     if imu.suffix.lower() == ".mat":
         return _load_course(imu, truth)
-    columns = read_columns(imu, "time")
-    missing = [c for c in ("time", *_CHANNELS) if c not in columns]
-    if missing:
-        raise BadInput(f"{imu}: missing {', '.join(missing)} (columns: {', '.join(columns)})")
-    stamps = _stamps(columns["time"], imu, "time")
+    table = _table(imu)
+    table.require(("time", *_CHANNELS))
+    columns = table.columns(("time", *_CHANNELS, *_QUATERNION))
+    stamps = _imu_stamps(columns["time"], imu, "time")
     values = {c: finite(columns[c], imu, c) for c in _CHANNELS}
     gyro, accel = (np.stack([values[f"{kind}_{axis}"] for axis in "xyz"], axis=1) for kind in ("gyro", "accel"))
     files: tuple[Path, ...] = (imu,)
@@ -99,17 +114,15 @@ def _role(path: Path, *, strict: bool) -> str | None:
         raise BadInput(f"{path}: expected a data file that ends in {', '.join(_SUFFIXES)}")
     try:
         if path.suffix.lower() == ".mat":
-            fields = {name for name, *_ in scipy.io.whosmat(path)}
+            fields = {name.lower() for name in mat_shapes(path)}
             role = "truth" if "rots" in fields else "imu" if "vals" in fields else "camera" if "cam" in fields else None
         else:
-            role = "imu" if "time" in read_columns(path, "time") else None
+            # A file that was named itself is told what it lacks; others with stamps of their own may lie beside.
+            names = _table(path).names
+            role = "imu" if "time" in names and (strict or set(_CHANNELS) <= set(names)) else None
     except BadInput:
         if strict:
             raise
-        return None
-    except Exception as error:  # scipy raises whatever a damaged file makes it trip over
-        if strict:
-            raise unreadable(path, error) from error
         return None
     if role is None and strict:
         raise BadInput(
@@ -131,17 +144,23 @@ def _truth_of(imu: Path, truths: list[Path]) -> Path | None:
 
 def _number(path: Path) -> str | None:
     match = re.search(r"(\d+)$", path.stem)
-    return match.group(1) if match else None
+    return match.group(1).lstrip("0") or "0" if match else None
+
+
+def _table(path: Path) -> Table:
+    return read_table(path, dict.fromkeys(_STAMPS, "time"))
 
 
 def _load_course(imu: Path, truth: Path | None) -> ImuLog:
     fields = read_mat(imu)
     vals = field(fields, "vals", imu)
     if vals.ndim != 2 or vals.shape[0] != 6:
-        raise BadInput(f"{imu}: expected `vals` of shape 6×T (ax, ay, az, wz, wx, wy), got {shape_text(vals)}")
+        remedy = "; transpose it" if vals.ndim == 2 and vals.shape[1] == 6 else ""
+        what = "`vals` of shape 6×T (ax, ay, az, wz, wx, wy)"
+        raise BadInput(f"{imu}: expected {what}, got {shape_text(vals)}{remedy}")
     # Unsigned counts wrap around when a bias is subtracted: floats from here on.
     vals = finite(vals.astype(float), imu, "vals")
-    stamps = _stamps(field(fields, "ts", imu).astype(float).ravel(), imu, "ts")
+    stamps = _imu_stamps(_stamps_field(fields, imu), imu, "ts")
     if len(stamps) != vals.shape[1]:
         raise BadInput(f"{imu}: `ts` has {len(stamps)} stamps and `vals` {vals.shape[1]} columns; they must agree")
     reference = (np.empty(0), np.empty((0, 4))) if truth is None else _load_truth(truth)
@@ -153,8 +172,9 @@ def _load_truth(path: Path) -> tuple[Array, Array]:
     fields = read_mat(path)
     rots = field(fields, "rots", path).astype(float)
     if rots.ndim != 3 or rots.shape[:2] != (3, 3):
-        raise BadInput(f"{path}: expected `rots` of shape 3×3×N, got {shape_text(rots)}")
-    stamps = field(fields, "ts", path).astype(float).ravel()
+        remedy = "; move its first axis to the end" if rots.ndim == 3 and rots.shape[1:] == (3, 3) else ""
+        raise BadInput(f"{path}: expected `rots` of shape 3×3×N, got {shape_text(rots)}{remedy}")
+    stamps = _stamps_field(fields, path)
     if len(stamps) != rots.shape[2]:
         raise BadInput(f"{path}: `ts` has {len(stamps)} stamps and `rots` {rots.shape[2]} frames; they must agree")
     matrices = np.moveaxis(rots, -1, 0)
@@ -164,17 +184,31 @@ def _load_truth(path: Path) -> tuple[Array, Array]:
     good[good] = np.linalg.det(matrices[good]) > 0
     q = np.full((len(stamps), 4), np.nan)
     q[good] = quaternions.from_matrix(matrices[good])
-    return _good_truth(_stamps(stamps, path, "ts"), q, path)
+    return _good_truth(_in_order(stamps, path, "ts"), q, path)
 
 
 def _good_truth(stamps: Array, q: Array, path: Path) -> tuple[Array, Array]:
-    good = np.isfinite(q).all(1)
+    """The samples that are there: a lost one is NaN, or zero."""
+    good = np.isfinite(q).all(1) & q.any(1)
     if np.any(np.abs(np.linalg.norm(q[good], axis=1) - 1) > 0.01):
         raise BadInput(f"{path}: qw, qx, qy, qz are not unit quaternions (NaN marks a missing truth)")
     return stamps[good], quaternions.continuous(quaternions.normalise(q[good]))
 
 
-def _stamps(stamps: Array, path: Path, name: str) -> Array:
+def _stamps_field(fields: dict[str, Any], path: Path) -> Array:
+    """The stamps (N,), in s, under whichever of their names the file has."""
+    name = next((name for name in _STAMPS if spelled(fields, name)), _STAMPS[0])
+    return field(fields, name, path).astype(float).ravel()
+
+
+def _imu_stamps(stamps: Array, path: Path, name: str) -> Array:
+    _in_order(stamps, path, name)
+    if (spacing := float(np.median(np.diff(stamps)))) > _SLOWEST:
+        raise BadInput(f"{path}: {name} has {spacing:g} s between samples, which is no IMU's; give seconds")
+    return stamps
+
+
+def _in_order(stamps: Array, path: Path, name: str) -> Array:
     if len(stamps) < 2:
         raise BadInput(f"{path}: {name} has {len(stamps)} samples; at least 2 are needed")
     finite(stamps, path, name)

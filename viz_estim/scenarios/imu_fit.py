@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array, conjugate, multiply
+from viz_estim.core.robust import by_second, solve, typical
 from viz_estim.errors import BadInput
 from viz_estim.files import sha256
 from viz_estim.scenarios.imu_calibration import ACCEL_SIGNS, DOCUMENTED, MV_PER_COUNT, Calibration
@@ -23,9 +22,9 @@ _WINDOW = 0.25  # s: over a shorter one the reference's noise is large beside th
 _FEWEST_WINDOWS = 20  # in a set: 5 s
 _LONGEST_STEP = 0.1  # s: over a longer one between two samples nobody knows how the body turned
 _LARGEST_OFFSET = 0.1  # s, between the two clocks
-_BLOCK = 1.0  # s: residuals in different blocks are taken as independent
 _LEAST_RATE = 0.03  # rad/s rms about an axis, over all sets: below, there is nothing but the reference's noise
 _LEAST_SWING = 0.05  # of gravity, from the 5th to the 95th percentile of what a channel sees over all sets
+_LARGEST_RATIO = 2.0  # of a sensitivity to the documented one: beyond, it is another sensor, or another row
 _LARGEST_ERROR = 0.05  # of a sensitivity: with less certainty it is not worth having
 
 
@@ -102,7 +101,7 @@ def fit(logs: list[ImuLog]) -> Fit:
     Gyro: the reference's rotation over windows of 0.25 s against the gyro's, integrated. The reference is the response,
     so that its noise widens the residual and leaves the gain alone; a regression on its differentiated attitude would
     pull the gain down (errors in variables; Fuller 1987, ch. 1). Accelerometer: counts against gravity in body axes as
-    the reference has it; the hand's own accelerations average out. Standard errors: `_solve`.
+    the reference has it; the hand's own accelerations average out. Standard errors: `robust.solve`.
     Raises BadInput where a set is not in counts or has no motion capture, or all move too little to tell the constants.
     """
     sets, names = [_Set.of(log) for log in logs], ", ".join(map(_name, logs))
@@ -120,12 +119,22 @@ def fit(logs: list[ImuLog]) -> Fit:
                 "don't belong together; give the file that does, or shift its stamps"
             )
     (accel_bias, accel_sensitivity), accel_se = _fit_accel(sets, offsets)
-    for sensor, value, error in (("gyro", gyro_sensitivity, gyro_se[1]), ("accel", accel_sensitivity, accel_se[1])):
-        vague = ~(error < _LARGEST_ERROR * value)
+    for sensor, value, error, documented in (
+        ("gyro", gyro_sensitivity, gyro_se[1], DOCUMENTED.gyro_sensitivity),
+        ("accel", accel_sensitivity, accel_se[1], DOCUMENTED.accel_sensitivity),
+    ):
+        vague = ~(error < _LARGEST_ERROR * np.abs(value))
         if vague.any():
             raise BadInput(
                 f"{names}: the {sensor}'s sensitivity along {_axes(vague)} stays unsure ({value[vague][0]:.3g} ± "
                 f"{error[vague][0]:.2g}): too little motion, or not the files of one set; add a set that turns more"
+            )
+        foreign = ~(np.abs(np.log(np.maximum(value / documented, 1e-300))) < np.log(_LARGEST_RATIO))
+        if foreign.any():
+            raise BadInput(
+                f"{names}: the {sensor}'s sensitivity along {_axes(foreign)} comes out as {value[foreign][0]:.3g}, "
+                f"{documented[foreign][0]:.3g} is documented: are the rows ax, ay, az, wz, wx, wy, in counts, with the "
+                "course's signs?"
             )
     after = Calibration(accel_bias, accel_sensitivity, gyro_sensitivity, gyro_bias)
     residuals: dict[str, dict[str, dict[str, list[float]]]] = {"accel_mps2": {}, "gyro_deg": {}}
@@ -216,7 +225,7 @@ def _fit_gyro(sets: list[_Set], names: str) -> tuple[list[Array], list[Array]]:
         return np.stack([(residual(x + h) - residual(x - h)) / (2 * h.sum()) for h in steps], axis=1)
 
     start = np.concatenate([DOCUMENTED.gyro_bias, DOCUMENTED.gyro_sensitivity, np.zeros(len(sets))])
-    x, errors = _solve(residual, jacobian, start, np.repeat(_blocks([one.begin for one in sets]), 3))
+    x, errors = solve(residual, jacobian, start, np.repeat(by_second([one.begin for one in sets]), 3))
     if np.abs(residual(x)).mean() > 0.5 * np.abs(turned).mean():
         raise BadInput(
             f"{names}: the gyro's readings stay unsure: they don't explain how the body turned; other files?"
@@ -229,7 +238,7 @@ def _fit_accel(sets: list[_Set], offsets: Array) -> tuple[Array, Array]:
     gravity = np.concatenate([one.gravity(offset) for one, offset in zip(sets, offsets, strict=True)])
     known = np.isfinite(gravity[:, 0])
     counts = np.concatenate([one.data.log.accel for one in sets])[known]
-    blocks = _blocks([one.data.time for one in sets])[known]
+    blocks = by_second([one.data.time for one in sets])[known]
     pushes, starts = (
         ACCEL_SIGNS * gravity[known] / MV_PER_COUNT,
         zip(DOCUMENTED.accel_bias, DOCUMENTED.accel_sensitivity, strict=True),
@@ -240,46 +249,13 @@ def _fit_accel(sets: list[_Set], offsets: Array) -> tuple[Array, Array]:
 
 def _fit_line(regressor: Array, response: Array, start: tuple[float, float], blocks: np.ndarray) -> tuple[Array, Array]:
     A = np.stack([np.ones_like(regressor), regressor], axis=1)
-    return _solve(lambda x: A @ x - response, lambda x: A, np.array(start), blocks)
-
-
-def _solve(
-    residual: Callable[[Array], Array], jacobian: Callable[[Array], Array], start: Array, blocks: np.ndarray
-) -> tuple[Array, Array]:
-    """The minimum of a soft-L1 loss, its scale from the median residual, and standard errors.
-
-    The errors are the sandwich H⁻¹ (Σ_b g_b g_bᵀ) H⁻¹, g_b the loss's gradient over block b: residuals within a block
-    may hang together as they like (Liang & Zeger 1986). blocks (M,): a whole number for each residual.
-    """
-    x, scale = start, 1.0
-    for _ in range(3):  # the scale follows the residuals
-        scale = max(1.5 * _typical(residual(x)), 1e-9)
-        x = least_squares(residual, x, jacobian, loss="soft_l1", f_scale=scale, x_scale="jac").x
-    r, J = residual(x), jacobian(x)
-    z = 1.0 + (r / scale) ** 2
-    H = J.T @ (J * z[:, None] ** -1.5)  # soft-L1 has ρ' = z^(-1/2) and ρ' + 2ρ''r²/scale² = z^(-3/2)
-    gradients = np.zeros((blocks.max() + 1, len(x)))
-    np.add.at(gradients, blocks, J * (r * z**-0.5)[:, None])
-    half = np.linalg.lstsq(H, gradients.T)[0]
-    count = len(np.unique(blocks))
-    return x, np.sqrt((half**2).sum(1) * count / (count - 1))
-
-
-def _blocks(stamps: list[Array]) -> np.ndarray:
-    """Numbers (M,) of the blocks of 1 s that the sets' stamps fall in; no two sets share one."""
-    sizes = [int(t[-1] / _BLOCK) + 1 for t in stamps]
-    firsts = np.cumsum([0, *sizes[:-1]])
-    return np.concatenate([first + (t / _BLOCK).astype(int) for first, t in zip(firsts, stamps, strict=True)])
+    return solve(lambda x: A @ x - response, lambda x: A, np.array(start), blocks)
 
 
 def _summary(errors: list[Array]) -> dict[str, list[float]]:
     e = np.concatenate(errors)
     e = e[np.isfinite(e).all(1)]
-    return {"rms": np.sqrt((e * e).mean(0)).tolist(), "typical": [_typical(channel) for channel in e.T]}
-
-
-def _typical(residual: Array) -> float:
-    return float(1.4826 * np.median(np.abs(residual)))
+    return {"rms": np.sqrt((e * e).mean(0)).tolist(), "typical": [typical(channel) for channel in e.T]}
 
 
 def _axes(which: np.ndarray) -> str:

@@ -50,7 +50,9 @@ def simulate(
     truth_stamps = _stamps(rng, duration, 0.0100, 0.0004)
     seen = (truth_stamps > 0.1) & (truth_stamps < duration - 0.2)  # motion capture starts later and ends earlier
     truth_stamps = truth_stamps[seen]
-    truth = attitude[np.minimum((truth_stamps / _FINE).astype(int), len(grid) - 1)]
+    at = np.minimum((truth_stamps / _FINE).astype(int), len(grid) - 1)
+    # To the stamp itself, not to the grid's last point: half of a millisecond is two errors of a fitted clock offset.
+    truth = quaternions.multiply(attitude[at], quaternions.exp(rate[at] * (truth_stamps - grid[at])[:, None]))
     wobble = quaternions.exp(noise_scale * 0.003 * rng.standard_normal((len(truth), 3)))
     truth = quaternions.continuous(quaternions.multiply(truth, wobble))
     return ImuLog(start + stamps, accel, gyro, True, start + truth_stamps, truth), constants

@@ -22,9 +22,10 @@ from viz_estim.core.scenery import Landmarks
 from viz_estim.core.spaces import Euclidean, Product
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, whole
-from viz_estim.scenarios.checks import positive, probability
+from viz_estim.scenarios.checks import at_most, positive, probability
 from viz_estim.scenarios.ranges import directions, distances
-from viz_estim.scenarios.reading import expand, finite, read_columns
+from viz_estim.scenarios.reading import expand, finite
+from viz_estim.scenarios.tables import read_table
 
 _SUFFIXES = (".csv", ".npz")
 _RANGES = ("range_1", "range_2")
@@ -63,6 +64,7 @@ def landmarks(
     if source is not None:
         return _load(source)
     positive(duration=duration, rate=rate, accel_noise=accel_noise, range_noise=range_noise)
+    at_most(1e6, readings=duration * rate)
     time = np.arange(int(duration * rate) + 1) / rate
     if len(time) < 2:
         raise BadInput(f"duration={duration:g} s at rate={rate:g} has fewer than two readings; make one of them larger")
@@ -100,14 +102,17 @@ def landmarks_ekf(
 ) -> Scenario:
     """An EKF on position and velocity from ranges to two landmarks, which cannot tell a place from its mirror image.
 
-    initial: where the first two ranges cross, on the `side` of the line from landmark 1 to landmark 2. accel_noise is
+    initial: where the first two ranges cross, on the `side` of the line from landmark 1 to landmark 2; or the truth,
+    where it begins. accel_noise is
     white acceleration in m/s²/√Hz, range_noise in m; a gate is the probability with which a good reading passes.
     """
     positive(accel_noise=accel_noise, range_noise=range_noise, initial_velocity_std=initial_velocity_std)
-    start = _start(data, initial, side, range_noise, initial_velocity_std)
+    beliefs = _starts(data, initial, side, range_noise, initial_velocity_std)
     # The first reading is no news to a belief that was made of it.
     ticks = [
-        Tick(float(time), float(time - data.time[max(k - 1, 0)]), measurements={"range": data.ranges[k]} if k else {})
+        Tick(float(time), 0.0)
+        if k in beliefs
+        else Tick(float(time), float(time - data.time[k - 1]), measurements={"range": data.ranges[k]})
         for k, time in enumerate(data.time)
     ]
     notes = (
@@ -120,7 +125,7 @@ def landmarks_ekf(
     scenery = Landmarks(data.landmarks, ("1", "2"))
     return Scenario(
         estimator(data.landmarks, accel_noise, range_noise, probability("gate", gate)),
-        {0: start},
+        beliefs,
         ticks,
         data.truth if np.isfinite(data.truth).any() else None,
         {"landmarks": scenery},
@@ -160,14 +165,22 @@ def _process_noise(dt: float, accel_noise: float) -> Array:
     return accel_noise**2 * np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(2))
 
 
-def _start(data: LandmarksData, initial: str, side: str, range_noise: float, velocity_std: float) -> Gaussian:
-    """The belief at step 0: the truth, or where the first ranges cross; either as sure as one pair of ranges is."""
+def _starts(
+    data: LandmarksData, initial: str, side: str, range_noise: float, velocity_std: float
+) -> dict[int, Gaussian]:
+    """The start by step: where the first ranges cross, or the truth, which sets the belief where it begins."""
+    seen = np.concatenate([_crossing(data, 1.0 if side == "left" else -1.0, range_noise), np.zeros(2)])
+    means = {0: seen}
     if initial == "truth":
-        mean = np.where(np.isfinite(data.truth[0]), data.truth[0], 0.0)
-        if not np.isfinite(data.truth[0, :2]).all():
-            raise BadInput("initial=truth needs x and y in the first row, and this data has none: use initial=ranges")
-    else:
-        mean = np.concatenate([_crossing(data, 1.0 if side == "left" else -1.0, range_noise), np.zeros(2)])
+        known = np.isfinite(data.truth[:, :2]).all(1)
+        if not known.any():
+            raise BadInput("initial=truth needs x and y, and this data has none: use initial=ranges")
+        means[int(np.argmax(known))] = np.nan_to_num(data.truth[np.argmax(known)])
+    return {k: _belief(data, mean, range_noise, velocity_std) for k, mean in means.items()}
+
+
+def _belief(data: LandmarksData, mean: Array, range_noise: float, velocity_std: float) -> Gaussian:
+    """The belief with this mean, as sure of the place as one pair of ranges is."""
     H = directions(mean[:2], data.landmarks)
     cov = np.diag([0.0, 0.0, velocity_std**2, velocity_std**2])
     # On the line itself the ranges say nothing across it: there the belief is as wide as the landmarks are apart.
@@ -199,10 +212,9 @@ def _load(source: list[Path]) -> LandmarksData:
     path = found[0]
     if path.suffix.lower() not in _SUFFIXES:
         raise BadInput(f"{path}: expected a data file that ends in {' or '.join(_SUFFIXES)}")
-    columns = {name.lower(): values for name, values in read_columns(path, "time").items()}
-    missing = [name for name in _NEEDED if name not in columns]
-    if missing:
-        raise BadInput(f"{path}: missing {', '.join(missing)} (columns: {', '.join(columns)})")
+    table = read_table(path)
+    table.require(_NEEDED)
+    columns = table.columns((*_NEEDED, *_TRUTH))
     for name in _NEEDED:
         finite(columns[name], path, name)
     time = columns["time"]
@@ -224,6 +236,6 @@ def _load(source: list[Path]) -> LandmarksData:
 
 def _is_ours(path: Path) -> bool:
     try:
-        return set(_NEEDED) <= {name.lower() for name in read_columns(path, "time")}
+        return set(_NEEDED) <= set(read_table(path).names)
     except BadInput:
         return False

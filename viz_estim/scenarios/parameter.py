@@ -23,7 +23,8 @@ from viz_estim.core.run import Scenario, Tick
 from viz_estim.core.spaces import Euclidean, Product
 from viz_estim.errors import BadInput
 from viz_estim.scenarios.checks import positive
-from viz_estim.scenarios.reading import expand, finite, read_columns
+from viz_estim.scenarios.reading import expand, finite
+from viz_estim.scenarios.tables import read_table
 
 _SUFFIXES = (".csv", ".npz")
 _COLUMNS = {"y", "x", "a"}
@@ -33,7 +34,7 @@ _START_MEAN, _START_VARIANCE = 1.0, 2.0  # of x₀
 _PROCESS_STD, _READING_STD = 1.0, math.sqrt(0.5)
 _TRUE_A = -1.0
 _SEEDS = 200
-_NOTES = """The EKF learns **a** from readings that tell only |x|. Follow `a` and its ±σ against the truth, −1.
+_NOTES = """The EKF learns **a** from readings that tell only |x|. The tab *State* has **a** ±σ beside the truth, −1.
 
 - From `prior_a=-0.5` it settles near −1, from `prior_a=0.5` near +1, and fits the readings exactly as well: a and −a,
   with every other x turned round, give the same y. **The sign is the prior's, not the data's**; from 0 it never moves.
@@ -159,7 +160,7 @@ def _find(paths: list[Path]) -> Path:
 
 def _fits(path: Path) -> bool:
     try:
-        held = {name.lower() for name in read_columns(path, "y")}
+        held = set(read_table(path).names)
     except BadInput:  # nobody named this one
         return False
     return {"y"} <= held <= _COLUMNS
@@ -168,9 +169,9 @@ def _fits(path: Path) -> bool:
 def _load(path: Path) -> ParameterData:
     if path.suffix.lower() not in _SUFFIXES:
         raise BadInput(f"{path}: expected a .csv or .npz with the column `y`")
-    columns = {name.lower(): values for name, values in read_columns(path, "y").items()}
-    if "y" not in columns:
-        raise BadInput(f"{path}: missing y (columns: {', '.join(columns)})")
+    table = read_table(path)
+    table.require(("y",))
+    columns = table.columns(("y", "x", "a"))
     y = finite(columns["y"], path, "y")
     nothing = np.full(len(y), np.nan)
     return ParameterData(y, np.stack([columns.get(name, nothing) for name in ("x", "a")], axis=-1), (path,))

@@ -23,7 +23,7 @@ from viz_estim.core.scenery import Landmarks
 from viz_estim.core.spaces import SO2, Euclidean, Product, Space
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import plaza_files, plaza_simulation
-from viz_estim.scenarios.checks import positive, probability
+from viz_estim.scenarios.checks import at_most, positive, probability
 from viz_estim.scenarios.plaza_data import PlazaData, advance, located, prepare
 from viz_estim.scenarios.ranges import directions, distances
 
@@ -51,6 +51,7 @@ def plaza(
     if source is not None:
         return prepare(plaza_files.load(plaza_files.find(source)))
     positive(duration=duration, rate=rate, range_noise=range_noise)
+    at_most(1e6, duration=duration, rows=duration * rate)
     if duration < 5 or duration * rate < 10 or not 0 <= outliers < 1 or range_scale <= -1:
         raise BadInput(
             "a simulation needs duration ≥ 5 s and ≥ 10 rows, 0 ≤ outliers < 1 and range_scale > -1: "
@@ -226,12 +227,11 @@ def _tick(data: PlazaData, k: int, start: bool) -> Tick:
 
 def _notes(data: PlazaData) -> str:
     text = (
-        "Odometry moves the pose, ranges correct it. Run it with `range_bias=none`: the innovations of every `range/…` "
-        "lie **off zero on one side**, NIS far above its band: the ranges are longer than the filter believes, and it "
-        "pulls the pose away from the beacons. With `range_bias=constant` each beacon's bias is estimated and follows "
-        "the distance **up and down** (watch `bias` wander and NIS stay above its band): radio ranges that are a few "
-        "percent too long have no constant bias. With `range_bias=estimate` the common `scale` settles, and with it "
-        "all of them. A **gate** refuses ranges that came by a detour (NIS counts them all the same: a simulated "
-        "drive has some, Plaza1 none); over a wrong model it refuses good ones, and may lock itself out."
+        "Odometry moves the pose, ranges correct it. With `range_bias=none` every innovation of `range/…` lies **off "
+        "zero on one side** and NIS far above its band: the ranges are longer than the filter believes. With "
+        "`range_bias=constant` each beacon's bias follows the distance **up and down** (`bias` in the tab *State*): "
+        "ranges a few percent too long have no constant bias. With `range_bias=estimate` the common `scale` settles, "
+        "and all of them with it. The **gate** refuses ranges that came by a detour (NIS counts them all the same); "
+        "over a wrong model it refuses good ones, and may lock itself out."
     )
     return f"{text}\n\n**This data:** {data.notes}."

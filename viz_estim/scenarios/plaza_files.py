@@ -16,7 +16,7 @@ import scipy.io
 
 from viz_estim.core.quaternions import Array
 from viz_estim.errors import BadInput
-from viz_estim.scenarios.reading import expand, field, read_mat, shape_text
+from viz_estim.scenarios.reading import expand, field, mat_shapes, not_read, read_mat, shape_text
 
 _NAME = "Plaza.mat"
 _SUFFIXES = (".mat",)
@@ -52,7 +52,8 @@ def find(paths: list[Path]) -> Path:
         found += [file for file in files if not path.is_dir() or _is_ours(file)]
     where = ", ".join(map(str, paths))
     if not found:
-        raise BadInput(f"{where}: no file of odometry and ranges there (a .mat with `DR`, `TD` and `TL`)")
+        what = "a .mat with `DR`, `TD` and `TL`"
+        raise BadInput(f"{where}: no file of odometry and ranges there ({what}){not_read(paths)}")
     if len(found) > 1:
         raise BadInput(f"{len(found)} files of ranges found, a run takes one: name one of {', '.join(map(str, found))}")
     if found[0].suffix.lower() not in _SUFFIXES:
@@ -118,8 +119,8 @@ def save(folder: Path, log: PlazaLog) -> list[Path]:
 
 def _is_ours(path: Path) -> bool:
     try:
-        return {"DR", "TD", "TL"} <= {name.upper() for name, *_ in scipy.io.whosmat(path)}
-    except Exception:  # scipy raises whatever a damaged file makes it trip over; another file's damage is not ours
+        return {"DR", "TD", "TL"} <= {name.upper() for name in mat_shapes(path)}
+    except BadInput:  # another file's damage is not ours
         return False
 
 

@@ -20,7 +20,7 @@ from viz_estim.core.spaces import Euclidean
 from viz_estim.core.unscented import AugmentedFilter, Rule, scaled
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import quadrotor_files, quadrotor_simulation
-from viz_estim.scenarios.checks import positive, probability
+from viz_estim.scenarios.checks import at_most, positive, probability
 from viz_estim.scenarios.quadrotor_data import QuadrotorData, flight_along, motion_capture, together
 from viz_estim.scenarios.quadrotor_files import Camera, Flight
 from viz_estim.scenarios.quadrotor_model import Chart, Imu, Model
@@ -37,6 +37,7 @@ def quadrotor(
     """
     if source is None:
         positive(**{"data.duration": duration, "data.noise_scale": noise_scale})
+        at_most(3600.0, **{"data.duration": duration})
         flight, camera = quadrotor_simulation.simulate(rng, duration=duration, noise_scale=noise_scale)
         return together(flight, camera, "a simulated flight; the truth is exact.")
     flight_file, camera_file = quadrotor_files.find(source)
@@ -45,7 +46,8 @@ def quadrotor(
     if flight_file:
         flight = quadrotor_files.load_flight(flight_file)
         if seen:
-            return together(flight, seen, "measured by the camera; the truth is motion capture.", files)
+            known = "the truth is motion capture" if len(flight.states) else "nothing tells the truth"
+            return together(flight, seen, f"measured by the camera; {known}.", files)
         seen = motion_capture(flight)
         notes = (
             "no camera's measurements, so that motion capture serves as the measured pose, and is the truth too: the "

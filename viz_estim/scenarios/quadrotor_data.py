@@ -14,7 +14,7 @@ from viz_estim.scenarios.quadrotor_files import Camera, Flight
 from viz_estim.scenarios.quadrotor_simulation import carry_imu, smooth_path
 
 _LONGEST_GAP = 0.1  # s that are bridged: of motion capture, and from a camera's reading to the IMU's next sample
-_FEWEST = 12  # poses that a smooth path needs
+_FEWEST, _SLOWEST = 12, 0.2  # poses that a smooth path needs, and s from one to the next
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,16 @@ def flight_along(camera: Camera, rng: np.random.Generator, file: Path) -> Flight
     stamps, rows = np.unique(camera.stamps, return_index=True)
     if len(stamps) < _FEWEST:
         raise BadInput(f"{file}: has {len(stamps)} poses, a path through them needs at least {_FEWEST}")
-    return carry_imu(rng, stamps, smooth_path(stamps, camera.pose[rows]))
+    if (apart := float(np.median(np.diff(stamps)))) > _SLOWEST:
+        raise BadInput(
+            f"{file}: its poses are {apart:g} s apart, a path through them needs {_SLOWEST} s or less; add the "
+            "studentdata file of the flight, or give stamps in s"
+        )
+    try:
+        path = smooth_path(stamps, camera.pose[rows])
+    except ValueError as error:
+        raise BadInput(f"{file}: no smooth path goes through its poses ({error}); are there long gaps?") from error
+    return carry_imu(rng, stamps, path)
 
 
 def _at(times: Array, stamps: Array, states: Array) -> Array:

@@ -3,7 +3,7 @@
 The flight, `studentdata*.mat`: `data`, a struct array with `t` [s], `omg` [rad/s] and `acc` [m/s², specific force]
 (other fields such as `img` and `id`, and rows without a reading, are left); and motion capture, `vicon` 12×N (x, y, z,
 roll, pitch, yaw, then velocities of both) at `time` 1×N, NaN where it lost the body. What we write has the IMU's true
-biases too: `bias` 6×N (gyro, accelerometer).
+biases too: `bias` 6×N (gyro, accelerometer). Beside a camera's file the motion capture may lack.
 
 The camera, `proj2_dataset*.mat`: `time`, `position`, `angle` (both of the body) and `linearVel` (of the camera, in its
 own frame), N×3. All angles are roll, pitch, yaw with R = Rz(yaw)·Ry(pitch)·Rx(roll), body → world.
@@ -21,7 +21,7 @@ import scipy.io
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.errors import BadInput
-from viz_estim.scenarios.reading import expand, field, finite, read_mat, shape_text, unreadable
+from viz_estim.scenarios.reading import expand, field, finite, mat_shapes, not_read, read_mat, shape_text, spelled
 
 _FLIGHT, _CAMERA = {"data", "vicon"}, {"position", "angle", "linearvel", "angvel"}
 _IMU = {"t": ("t", "time"), "omg": ("omg", "drpy", "gyro"), "acc": ("acc", "accel")}
@@ -65,7 +65,8 @@ def find(paths: list[Path]) -> tuple[Path | None, Path | None]:
             raise BadInput(f"{len(files)} {role} files found, a run takes one: name one of {names}")
     if not any(roles.values()):
         where = ", ".join(map(str, paths))
-        raise BadInput(f"{where}: no flight there (a .mat with data, vicon and time, or with position and linearVel)")
+        what = "a .mat with data, vicon and time, or with position and linearVel"
+        raise BadInput(f"{where}: no flight there ({what}){not_read(paths)}")
     return next(iter(roles["flight"]), None), next(iter(roles["camera"]), None)
 
 
@@ -74,10 +75,10 @@ def _role(path: Path, *, strict: bool) -> str | None:
     if path.suffix.lower() != ".mat":
         raise BadInput(f"{path}: expected a MATLAB file that ends in .mat")
     try:
-        held = [name for name, *_ in scipy.io.whosmat(path)]
-    except Exception as error:  # scipy raises whatever a damaged file makes it trip over
+        held = mat_shapes(path)
+    except BadInput:
         if strict:
-            raise unreadable(path, error) from error
+            raise
         return None
     names = {name.lower() for name in held}
     role = "flight" if names & _FLIGHT else "camera" if len(names & _CAMERA) > 1 else None
@@ -110,6 +111,8 @@ def load_flight(path: Path) -> Flight:
     """The flight's file read and checked."""
     fields = read_mat(path)
     stamps, gyro, accel = _imu(fields, path)
+    if not spelled(fields, "vicon"):
+        return Flight(stamps, gyro, accel, np.empty(0), np.empty((0, 16)))
     vicon_stamps = _stamps(field(fields, "time", path), path, "time")
     vicon = field(fields, "vicon", path).astype(float)
     if vicon.shape != (12, len(vicon_stamps)):

@@ -1,4 +1,4 @@
-"""Data files of any system: a .mat file's fields, a .csv's or .npz's columns, and one line for what is wrong."""
+"""Data files of any system: finding them, a .mat file's fields, and one line for what is wrong."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import scipy.io
 from viz_estim.core.quaternions import Array
 from viz_estim.errors import BadInput
 
+_HDF5 = "is MATLAB v7.3 (HDF5), which is not read; in MATLAB save it anew with save(FILE, '-v7')"
+
 
 def expand(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """The file itself, or the folder's files that end so, sorted; BadInput where there is nothing."""
@@ -23,32 +25,31 @@ def expand(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def read_mat(path: Path) -> dict[str, Any]:
-    """The fields of a MATLAB file, by the names they have there."""
+    """The fields of a MATLAB file, by the names they have there; those of a struct stand beside it."""
     try:
         fields: dict[str, Any] = scipy.io.loadmat(path)
     except Exception as error:  # scipy raises whatever a damaged file makes it trip over
         raise unreadable(path, error) from error
-    return fields
+    return _unpacked(fields)
 
 
-def read_columns(path: Path, key: str) -> dict[str, Array]:
-    """The columns of a .csv (names in its first line) or an .npz, all as long as `key` where that is one of them."""
+def mat_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """The shapes of a MATLAB file's fields, by the names they have there, without reading the numbers."""
     try:
-        if path.suffix.lower() == ".npz":
-            with np.load(path, allow_pickle=False) as file:
-                columns = {name: np.asarray(file[name], float) for name in file.files}
-        else:
-            with path.open(encoding="utf-8-sig") as text:
-                names = [name.strip() for name in text.readline().split(",")]
-                rows = [line.split(",") for line in text if line.strip()]
-            columns = {name: np.array(values) for name, values in zip(names, _cells(path, names, rows), strict=True)}
-    except BadInput:
-        raise
-    except Exception as error:
+        found = scipy.io.whosmat(path)
+        structs = [name for name, shape, kind in found if kind == "struct" and shape == (1, 1)]
+        inner = _unpacked(scipy.io.loadmat(path, variable_names=structs)) if structs else {}
+    except Exception as error:  # as above
         raise unreadable(path, error) from error
-    if key in columns and any(c.ndim != 1 or c.shape != columns[key].shape for c in columns.values()):
-        raise BadInput(f"{path}: all columns must be one-dimensional and as long as `{key}`")
-    return columns
+    shapes = {name: np.shape(value) for name, value in inner.items() if not name.startswith("__")}
+    return shapes | {name: tuple(shape) for name, shape, _ in found}
+
+
+def not_read(paths: list[Path]) -> str:
+    """What to add where nothing was found: the MATLAB v7.3 files among files and folders, which are not read."""
+    files = [file for path in paths for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
+    found = [file.name for file in files if file.is_file() and _is_hdf5(file)]
+    return f"; {', '.join(found)[:100]}: {_HDF5}" if found else ""
 
 
 def spelled(fields: Mapping[str, Any], name: str) -> str | None:
@@ -80,6 +81,13 @@ def finite(values: Array, path: Path, name: str) -> Array:
 
 def unreadable(path: Path, error: Exception) -> BadInput:
     """What to say of a file that its reader tripped over."""
+    try:
+        with path.open("rb"):
+            pass
+    except OSError as closed:
+        return BadInput(f"{path}: cannot be opened ({closed.strerror})")
+    if _is_hdf5(path):
+        return BadInput(f"{path}: {_HDF5}")
     text = " ".join(str(error).split()) or type(error).__name__
     return BadInput(f"{path}: cannot be read, it may be truncated or of another format ({text[:120]})")
 
@@ -89,17 +97,19 @@ def shape_text(array: np.ndarray) -> str:
     return "×".join(map(str, array.shape)) or "a single number"
 
 
-def _cells(path: Path, names: list[str], rows: list[list[str]]) -> list[list[float]]:
-    """The columns of a table of texts; an empty cell is NaN."""
-    if not rows:
-        raise BadInput(f"{path}: is empty, or holds column names alone")
-    columns: list[list[float]] = [[] for _ in names]
-    for number, row in enumerate(rows, 2):
-        if len(row) != len(names):
-            raise BadInput(f"{path}: line {number} has {len(row)} cells, the first line {len(names)}")
-        for column, name, cell in zip(columns, names, row, strict=True):
-            try:
-                column.append(float(cell) if cell.strip() else np.nan)
-            except ValueError:
-                raise BadInput(f"{path}: line {number}, {name}: {cell.strip()!r} is not a number") from None
-    return columns
+def _is_hdf5(path: Path) -> bool:
+    """Whether it is HDF5, as MATLAB saves with `-v7.3`; the file's own mark stands behind MATLAB's 512 bytes."""
+    try:
+        with path.open("rb") as file:
+            return b"\x89HDF\r\n\x1a\n" in file.read(1024)
+    except OSError:
+        return False
+
+
+def _unpacked(fields: dict[str, Any]) -> dict[str, Any]:
+    """The fields, and beside them those of structs that hold one of each; a name outside goes before one inside."""
+    for value in list(fields.values()):
+        if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
+            inner = value.ravel()[0]
+            fields = _unpacked({name: inner[name] for name in value.dtype.names}) | fields
+    return fields

@@ -17,7 +17,7 @@ from viz_estim.core.scenery import Cloud
 from viz_estim.core.stages import Align
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import scan_files
-from viz_estim.scenarios.checks import positive
+from viz_estim.scenarios.checks import at_most, positive
 from viz_estim.scenarios.scan_files import ScanData
 
 _MOST = 200  # iterations, where none are prescribed
@@ -60,6 +60,7 @@ def scan(
         return scan_files.load(source)
     if points < 3 or noise < 0:
         raise BadInput(f"a simulation needs points ≥ 3 and noise ≥ 0: got points={points}, noise={noise:g}")
+    at_most(1e6, points=points)
     d = 2 if planar else 3
     turn = _TURN * rng.standard_normal(3)
     R = quaternions.to_matrix(quaternions.exp(turn * (0, 0, 1) if planar else turn))[:d, :d]
@@ -138,12 +139,10 @@ def _notes(data: ScanData, max_distance: float, iterations: int) -> str:
         else f"It ends when the matches repeat, for then nothing moves any more, or after {_MOST} iterations. "
     )
     return (
-        f"X ({len(data.X)} points) is moved on to Y ({len(data.Y)}), one iteration a step. In **match** each point of "
-        f"X has a line to its nearest in Y, coloured by its length; points further than {max_distance:g} m from all of "
-        "Y have none. Long lines that lean one way are what is left to move; long lines at a rim are points that the "
-        "other scan never saw. In **align** the pose is fitted to these pairs.\n\n"
-        "While **K**, the number of matches, rises, RMSE may rise with it, for the new pairs are the long ones: "
-        f"compare it at one K only. {end}Repeating is no proof of being right: from a start too far off, or with "
-        "max_distance too small, the matches can repeat at a wrong pose. The covariance takes every match as right, so "
-        "that it is far too small: look at **NEES**."
+        f"X ({len(data.X)} points) is moved on to Y ({len(data.Y)}), one iteration a step. **match** draws a line from "
+        f"each point of X to its nearest in Y within {max_distance:g} m; **align** fits the pose to these pairs. Long "
+        "lines that lean one way are what is left to move; at a rim they are points that the other scan never saw.\n\n"
+        "While **K**, the count of matches, rises, RMSE may rise with it: the new pairs are the long ones. "
+        f"{end}Repeating is no proof of being right: from a start too far off, the matches can repeat at a wrong pose. "
+        "The covariance takes every match as right, so that it is far too small (**NEES**)."
     )

@@ -1,12 +1,13 @@
 """Files of two clouds and of the true pose between them: which file is what, reading, writing.
 
-A cloud is a PLY file, or text, blank- or comma-separated, one point a line: x, y[, z] first, or where a header names
-them. Poses are a CSV list with `reading`, a cloud's file name, and `gT00` … `gT33` (in the plane `gT00` … `gT22`), the
-matrix that takes its points into the common frame, as libpointmatcher's lists have them.
+A cloud is a PLY file, or text, separated by blanks, commas or semicolons, one point a line: x, y[, z] first, or where a
+header names them. Poses are a CSV list with `reading`, a cloud's file name, and `gT00` … `gT33` (in the plane `gT00` …
+`gT22`), the matrix that takes its points into the common frame, as libpointmatcher's lists have them.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from viz_estim.scenarios.reading import expand, unreadable
 _SUFFIXES = (".txt", ".csv", ".xyz", ".ply")  # of what a folder is searched for
 _SAVED = ("cloudX.csv", "cloudY.csv", "cloudList.csv")
 _AXES = ("x", "y", "z")
+_METRES = re.compile(r"\s*[\[(]\s*m\s*[\])]")  # beside a name in a header
 _NOT_RIGID = 1e-3  # of a rotation matrix from the one nearest to it, whose file may hold few digits
 
 
@@ -148,19 +150,22 @@ def _read_text(path: Path) -> tuple[list[str], list[tuple[int, str]]]:
         raise unreadable(path, error) from error
     lines = []
     for number, line in enumerate(text.splitlines(), 1):
-        said = line.lstrip("#/ \t")  # a comment, unless it is where a program puts the names: `//X Y Z`
+        said = line.lstrip("#/% \t")  # a comment, unless it is where a program puts the names: `//X Y Z`
         if said and (said == line.lstrip() or {"x", "y"} <= set(_cells(said.lower()))):
             lines.append((number, said))
+    if lines and lines[0][1].strip() == str(len(lines) - 1):  # how many points there are, as .xyz files begin
+        lines.pop(0)
     names: list[str] = []
     if lines and not _is_number(_cells(lines[0][1])[0]):
-        names = [cell.strip('"').lower() for cell in _cells(lines.pop(0)[1])]
+        names = [cell.strip('"').lower() for cell in _cells(_METRES.sub("", lines.pop(0)[1]))]
     if not lines:
         raise BadInput(f"{path}: {'holds column names alone' if names else 'is empty'}")
     return names, lines
 
 
 def _cells(line: str) -> list[str]:
-    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
+    separator = next((mark for mark in ";," if mark in line), None)
+    return [cell.strip() for cell in line.split(separator)]
 
 
 def _is_number(cell: str) -> bool:

@@ -70,6 +70,8 @@ def _header(path: Path, data: bytes) -> tuple[int, str, list[_Element]]:
                     order = _ORDERS[name]
                 case ["element", name, count]:
                     elements.append(_Element(name, int(count)))
+                    if elements[-1].count < 0:
+                        raise ValueError
                 case ["property", "list", _, _, name]:
                     elements[-1].properties[name] = None
                 case ["property", kind, name]:

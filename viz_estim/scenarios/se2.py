@@ -19,7 +19,7 @@ from viz_estim.core.scenery import Box, Scenery
 from viz_estim.core.spaces import SE2, Product
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import se2_files
-from viz_estim.scenarios.checks import positive
+from viz_estim.scenarios.checks import at_most, positive
 from viz_estim.scenarios.se2_files import Drive, speed_and_turn
 
 SPACE = Product(pose=SE2())
@@ -58,6 +58,7 @@ def se2_pf(
     positive(wheel_noise=wheel_noise, gps_noise=gps_noise)
     if particles < 1:
         raise BadInput(f"particles must be at least 1, got {particles}")
+    at_most(1e7, particles=particles)
     if not 0 < resample_below <= 1:
         raise BadInput(f"resample_below is a fraction above 0 and up to 1, got {resample_below:g}")
     drive = data if times is None else _asked(data, times)

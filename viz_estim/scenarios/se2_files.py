@@ -1,6 +1,6 @@
 """Files of a differential drive in the plane: the course's problem, and logs of a real one; reading, checking, writing.
 
-Tables with names in the first line, separated by commas or blanks, names in any case and order; others are left.
+Tables as `tables` reads them, columns in any order; others are left.
 
 - A problem: `time` s, `left` and `right` (wheel rates in rad/s that act up to that time), and where there is a reading
   of the position `x` and `y` m.
@@ -18,11 +18,13 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import wrap
 from viz_estim.errors import BadInput
-from viz_estim.scenarios.reading import expand, unreadable
+from viz_estim.scenarios.reading import expand
+from viz_estim.scenarios.tables import Table, read_table
 
 RADIUS, TRACK = 0.25, 0.5  # m: of a wheel, and between the wheels
 _SUFFIXES = (".csv", ".txt")
 _PROBLEM, _LOG = ("time", "left", "right"), ("t", "vx", "gyro")
+_POSITION, _TRUTH = ("x", "y"), ("px", "py", "theta")
 _WHAT = f"a .csv or .txt with the columns {', '.join(_PROBLEM)}, or {', '.join(_LOG)}"
 
 
@@ -77,32 +79,33 @@ def find(paths: list[Path]) -> Path:
 
 def load(path: Path) -> Drive:
     """The file read and checked; NaN is allowed where a reading of the position or the truth is absent, alone."""
-    names, rows = _table(path)
-    needed = _PROBLEM if "left" in names or "right" in names else _LOG
-    missing = [name for name in needed if name not in names]
+    table = read_table(path)
+    needed = _PROBLEM if "left" in table or "right" in table else _LOG
+    missing = [name for name in needed if name not in table]
     if missing:
-        raise BadInput(f"{path}: missing {', '.join(missing)} (columns: {', '.join(names)[:200]}); expected {_WHAT}")
-    columns = dict(zip(names, _numbers(path, names, rows), strict=True))
+        raise BadInput(f"{path}: missing {', '.join(missing)} ({table.held()}); expected {_WHAT}")
+    columns = table.columns((*needed, *(_POSITION if needed is _PROBLEM else _TRUTH)))
     for name in needed:
         bad = np.flatnonzero(~np.isfinite(columns[name]))
         if len(bad):
-            raise BadInput(f"{path}: line {bad[0] + 2}, {name} is not a finite number; measurements must be finite")
+            where = table.where(bad[0])
+            raise BadInput(f"{path}: {where}, {name} is not a finite number; measurements must be finite")
     time = columns[needed[0]]
     back = np.flatnonzero(np.diff(time) <= 0)
     if len(back):
-        raise BadInput(f"{path}: line {back[0] + 3}, {needed[0]} does not increase; sort the rows by time")
+        raise BadInput(f"{path}: {table.where(back[0] + 1)}, {needed[0]} does not increase; sort the rows by time")
     empty = np.full(len(time), np.nan)
     if needed is _PROBLEM:
         rates = np.stack([columns["left"], columns["right"]], axis=-1)
         positions, truth = (
-            np.stack([columns.get(name, empty) for name in ("x", "y")], axis=-1),
+            np.stack([columns.get(name, empty) for name in _POSITION], axis=-1),
             np.tile(empty, (3, 1)).T,
         )
-        _whole(path, positions, "x and y")
+        _whole(table, positions, "x and y")
         noise = problem().wheel_noise
     else:
         rates, positions = wheel_rates(columns["vx"], columns["gyro"]), np.tile(empty, (2, 1)).T
-        truth = np.stack([columns.get(name, empty) for name in ("px", "py", "theta")], axis=-1)
+        truth = np.stack([columns.get(name, empty) for name in _TRUTH], axis=-1)
         truth[:, 2] = wrap(truth[:, 2])
         noise = 0.4  # what the Wifibot's log shows beside its truth
     return Drive(time - time[0], rates, positions, truth, noise, (path,))
@@ -121,42 +124,14 @@ def save(path: Path, drive: Drive) -> list[Path]:
 
 def _fits(path: Path) -> bool:
     try:
-        names = _table(path)[0]
+        names = read_table(path).names
     except BadInput:
         return False
     return set(_PROBLEM) <= set(names) or set(_LOG) <= set(names)
 
 
-def _table(path: Path) -> tuple[list[str], list[list[str]]]:
-    """The names in lower case, and the cells by line."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").rstrip().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise unreadable(path, error) from error
-    if len(lines) < 2:
-        raise BadInput(f"{path}: is empty, or holds column names alone; at least two lines are needed")
-    separator = "," if "," in lines[0] else None
-    names, *rows = ([cell.strip() for cell in line.split(separator)] for line in lines)
-    return [name.lower() for name in names], rows
-
-
-def _numbers(path: Path, names: list[str], rows: list[list[str]]) -> Array:
-    """The columns as numbers; an empty cell is NaN."""
-    if len(set(names)) < len(names):
-        raise BadInput(f"{path}: two columns have one name (columns: {', '.join(names)[:200]}); keep one of them")
-    for number, row in enumerate(rows, 2):
-        if len(row) != len(names):
-            raise BadInput(f"{path}: line {number} has {len(row)} cells, the first line {len(names)}")
-        for name, cell in zip(names, row, strict=True):
-            try:
-                float(cell or "nan")
-            except ValueError:
-                raise BadInput(f"{path}: line {number}, {name}: {cell[:40]!r} is not a number") from None
-    return np.array([[float(cell or "nan") for cell in row] for row in rows]).T
-
-
-def _whole(path: Path, values: Array, names: str) -> None:
+def _whole(table: Table, values: Array, names: str) -> None:
     known = np.isfinite(values)
     half = np.flatnonzero((known.any(1) & ~known.all(1)) | np.isinf(values).any(1))
     if len(half):
-        raise BadInput(f"{path}: line {half[0] + 2}, {names} must both be finite, or both be empty")
+        raise BadInput(f"{table.path}: {table.where(half[0])}, {names} must both be finite, or both be empty")

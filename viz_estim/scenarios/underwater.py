@@ -16,6 +16,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario, Tick
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import underwater_files
+from viz_estim.scenarios.checks import at_most
 from viz_estim.scenarios.underwater_files import LABELS, UnderwaterData
 
 # The exercise's figures, from which the simulation draws: what each event has beforehand, and how often each sensor
@@ -35,6 +36,7 @@ def underwater(
     _probabilities(stay=stay)
     if steps < 1:
         raise BadInput(f"steps must be at least 1, got {steps}")
+    at_most(1e6, steps=steps)
     # The label is drawn at step 0 and wherever it does not stay, and holds until it is drawn anew.
     drawn = rng.choice(len(LABELS), steps, p=_PRIOR)
     anew = rng.random(steps) >= stay

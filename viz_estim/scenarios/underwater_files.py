@@ -1,7 +1,7 @@
 """Files of two warning sensors: reading, checking, writing.
 
 A CSV file with the columns `time` [s], `sonar` and `flow` [1 where the sensor warns, else 0] and, where the truth is
-known, `state` (a label; an empty cell where it is not). Names and labels in any case and order; other columns are left.
+known, `state` (a label; an empty cell where it is not). Labels in any case, columns in any order; others are left.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.errors import BadInput
-from viz_estim.scenarios.reading import expand, unreadable
+from viz_estim.scenarios.reading import expand
+from viz_estim.scenarios.tables import Table, read_table
 
 LABELS = ("hazard", "current", "clear")
 _COLUMNS = ("time", "sonar", "flow")
@@ -44,24 +45,14 @@ def find(paths: list[Path]) -> Path:
 
 def load(path: Path) -> UnderwaterData:
     """The file read and checked."""
-    names, *rows = _read_rows(path)
-    held = f"columns: {', '.join(names)[:200]}"
-    missing = [name for name in _COLUMNS if name not in names]
-    if missing:
-        raise BadInput(f"{path}: missing {', '.join(missing)} ({held})")
-    if len(set(names)) < len(names):
-        raise BadInput(f"{path}: two columns have one name ({held}); keep one of them")
-    if not rows:
-        raise BadInput(f"{path}: holds column names alone; at least one reading is needed")
-    for number, row in enumerate(rows, 2):
-        if len(row) != len(names):
-            raise BadInput(f"{path}: line {number} has {len(row)} cells, the first line {len(names)}")
-    cells = {name: [row[i] for row in rows] for i, name in enumerate(names)}
-    time, sonar, flow = ([_number(path, name, k, cell) for k, cell in enumerate(cells[name], 2)] for name in _COLUMNS)
-    truth = [_label(path, k, cell) for k, cell in enumerate(cells.get("state", [""] * len(rows)), 2)]
+    table = read_table(path)
+    table.require(_COLUMNS)
+    time, sonar, flow = (_numbers(table, name) for name in _COLUMNS)
+    states = table.texts("state") if "state" in table else [""] * len(time)
+    truth = [_label(table, row, cell.lower()) for row, cell in enumerate(states)]
     back = np.flatnonzero(np.diff(time) < 0)
     if len(back):
-        raise BadInput(f"{path}: line {back[0] + 3}, time goes back; sort the readings by time")
+        raise BadInput(f"{path}: {table.where(back[0] + 1)}, time goes back; sort the readings by time")
     return UnderwaterData(np.array(time), np.array(sonar), np.array(flow), np.array(truth), (path,))
 
 
@@ -78,38 +69,30 @@ def save(path: Path, data: UnderwaterData) -> list[Path]:
 
 def _is_readings(path: Path) -> bool:
     try:
-        return set(_COLUMNS) <= set(_read_rows(path)[0])
+        return set(_COLUMNS) <= set(read_table(path).names)
     except BadInput:
         return False
 
 
-def _read_rows(path: Path) -> list[list[str]]:
-    """The cells of a CSV file by line, in lower case: people write `State` and `SONAR`."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise unreadable(path, error) from error
-    if not text.strip():
-        raise BadInput(f"{path}: is empty")
-    return [[cell.strip().lower() for cell in line.split(",")] for line in text.rstrip().splitlines()]
+def _numbers(table: Table, name: str) -> Array:
+    """A column of stamps or readings."""
+    values = table.numbers(name)
+    bad = ~np.isfinite(values) if name == "time" else ~np.isin(values, (0.0, 1.0))
+    if bad.any():
+        row = int(np.argmax(bad))
+        cell = table.texts(name)[row]
+        where = f"{table.path}: {table.where(row)}, {name}: {cell!r}"
+        if not math.isfinite(values[row]):
+            raise BadInput(f"{where} is {'not finite' if cell else 'not a number'}; leave the line out")
+        raise BadInput(f"{where} is neither 0 nor 1 (1 where the sensor warns)")
+    return values
 
 
-def _number(path: Path, name: str, line: int, cell: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        raise BadInput(f"{path}: line {line}, {name}: {cell[:40]!r} is not a number") from None
-    if not math.isfinite(value):
-        raise BadInput(f"{path}: line {line}, {name}: {cell!r} is not finite; leave the line out")
-    if name != "time" and value not in (0.0, 1.0):
-        raise BadInput(f"{path}: line {line}, {name}: {cell!r} is neither 0 nor 1 (1 where the sensor warns)")
-    return value
-
-
-def _label(path: Path, line: int, cell: str) -> float:
+def _label(table: Table, row: int, cell: str) -> float:
     """The label's index; an empty cell or NaN is an unknown one."""
     if cell in ("", "nan"):
         return math.nan
     if cell not in LABELS:
-        raise BadInput(f"{path}: line {line}, state: {cell[:40]!r} is none of {', '.join(LABELS)}, and not empty")
+        what = f"{cell[:40]!r} is none of {', '.join(LABELS)}, and not empty"
+        raise BadInput(f"{table.path}: {table.where(row)}, state: {what}")
     return float(LABELS.index(cell))
