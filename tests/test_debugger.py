@@ -16,17 +16,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Cli
+from conftest import SHORT, Cli
 from test_survival import FAILING
 
 import viz_estim
 from viz_estim.core.run import Step, run
-from viz_estim.debugger import branches, forking, recorded
+from viz_estim.debugger import branches, findings, forking, recorded
 from viz_estim.debugger.branches import Branch, Screen
+from viz_estim.debugger.live import Beliefs, Live
 from viz_estim.debugger.recorded import Recorded
 from viz_estim.debugger.session import Session
-from viz_estim.debugger.sources import Beliefs, Live
+from viz_estim.diagnose import diagnose
 from viz_estim.recording import reader
+from viz_estim.recording.memory import collect
 from viz_estim.recording.reader import Run
 from viz_estim.recording.viewer import Viewer
 from viz_estim.running import Plan, plan
@@ -347,6 +349,57 @@ def test_an_estimator_that_carries_on_more_than_its_belief_is_found_out(tmp_path
     assert "carries on more" not in "\n".join(session.do("step 9"))
     told = "\n".join(session.do("step 9", "back 12", "back 2"))
     assert told.count("this estimator carries on more than its belief") == 1
+
+
+def test_findings_stop_a_run_that_goes_on_once_the_evidence_is_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(branches, "File", NoFile)
+    session = Told(live_branch("imu-ukf", *SHORT, seed=3))
+    assert session.do("break finding and step > 60")[1].startswith("of a run that goes on, findings are looked for")
+    told = session.do("continue")
+    frozen = session.step
+    assert told[-1].startswith("finding sensor_frozen of gyro")
+    assert session.branch.source.reached > frozen + 50
+    assert all(
+        line.startswith("finding since step ") for line in told[: told.index("breakpoint 1: finding and step > 60")]
+    )
+    session.do("back", "step")  # what is known is told, and stopped at, wherever it is passed again
+    assert session.do("back 9", "continue")[-1] == told[-1]
+    # A branch knows what was known where it parts, and looks on by itself.
+    session.do("set frozen=reject")
+    assert "sensor_frozen" not in str(session._findings())
+    while not session.do("continue")[-1].startswith("error: the run ends here"):
+        pass
+    # At the end both have what a diagnosis of the whole run has.
+    session.do("switch 1", "continue", "continue", "continue", "continue", "goto 9999")
+    for branch in session.branches:
+        source = branch.source
+        assert isinstance(source, Live)
+        assert branch.parts
+        steps = [source.step(k) for k in range(source.reached + 1)]
+        whole = diagnose(collect(source.scenario, steps, branch.parts[-1].plan.all_params()))
+        assert source.findings
+        known = [one for _, one in source.findings._known]
+        for one in whole:
+            assert any((one.code, one.sensor) == (other.code, other.sensor) for other in known), one
+
+
+def test_a_finding_that_began_behind_stops_where_the_evidence_is(walk: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Told(live_branch(walk, "noise=9"))
+    session.do("step 7", "break finding")
+    told = session.do("continue")
+    assert told[0].startswith("finding since step 0, before here: overconfident of gps")
+    assert told[-2:] == ["breakpoint 1: finding", "step 39  update  (stage 66)  3.9000 s"]
+    assert any(line.startswith("finding overconfident of gps") for line in session.do("reverse"))
+    session.do("delete 1", "reverse", "continue")
+    assert session._findings() == {}
+    # Whatever a diagnosis does costs no session.
+    with monkeypatch.context() as patch:
+        patch.setattr(findings, "diagnose", lambda run: 1 / 0)
+        told = session.do("break finding", "goto 0", "continue")
+    assert sum("the diagnosis raised ZeroDivisionError" in line for line in told) == 1
+    monkeypatch.setattr(findings, "_MOST", 100)
+    told = Told(live_branch(walk)).do("step", "break finding", "continue", "back", "continue")
+    assert sum("take more than 1 GB" in line for line in told) == 1
 
 
 @pytest.mark.parametrize(("fate", "stage"), [("raises", "predict"), ("is NaN", "correct")])

@@ -12,7 +12,7 @@ from test_debugger import WALK
 import viz_estim
 from viz_estim.core.run import run
 from viz_estim.debugger import forking
-from viz_estim.debugger.sources import Live
+from viz_estim.debugger.live import Live
 from viz_estim.recording.reader import Run
 from viz_estim.recording.recorder import Recorder
 from viz_estim.running import plan, recorded

@@ -14,8 +14,9 @@ from typing import Any
 from viz_estim.core.consistency import Tally
 from viz_estim.core.run import Step
 from viz_estim.debugger.forking import Part, properties
+from viz_estim.debugger.live import Live
 from viz_estim.debugger.recorded import Recorded
-from viz_estim.debugger.sources import Live, Source
+from viz_estim.debugger.sources import Source
 from viz_estim.recording.recorder import Recorder
 from viz_estim.recording.viewer import Viewer, ViewerError
 

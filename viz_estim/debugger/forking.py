@@ -12,7 +12,7 @@ import numpy as np
 
 from viz_estim.core.beliefs import Belief, Particles
 from viz_estim.core.run import Scenario, Tick, run
-from viz_estim.debugger.sources import Live
+from viz_estim.debugger.live import Live
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, sha256
 from viz_estim.parameters import nearest, parameters

@@ -16,9 +16,10 @@ from viz_estim.debugger.console import COMMANDS, Refused, count
 from viz_estim.debugger.differences import side_by_side
 from viz_estim.debugger.frame_text import health_text, names_text, place_text, quantity_text, why_text
 from viz_estim.debugger.functions import FUNCTIONS
+from viz_estim.debugger.live import Live
 from viz_estim.debugger.moving import Moving
 from viz_estim.debugger.recorded import Recorded
-from viz_estim.debugger.sources import Live, NoSuchPlace
+from viz_estim.debugger.sources import NoSuchPlace
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, whole
 from viz_estim.parameters import kind_text, parameters
@@ -100,6 +101,8 @@ class Session(Moving):
         step, index = self.step, int(self.frame.index[0])
         parts = forking.changed(parts, step, settings, again)
         source = again.fork(step, parts[-1].scenario)
+        if again.findings:
+            source.findings = again.findings.until(step, parts[-1].scenario, parts[-1].plan.all_params())
         number = len(self.branches) + 1
         about = f"{' '.join(settings)} from step {step} on"
         self.branch = branches.of_parts(number, about, parts, source, self.screen, self.branch.number)
