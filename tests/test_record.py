@@ -102,6 +102,154 @@ def test_it_opens_shows_compares_and_debugs_like_any_other(
     assert (forked.code, forked.err.count("\n")) == (2, 1)
 
 
+def cloud(path: Path) -> Array:
+    """A particle filter of 50 points as a person writes it; the weighted means at the end of each step."""
+    rng, (truth, z) = np.random.default_rng(0), readings()
+    x, means = rng.normal(0, 1, (50, 2)), []
+    with viz_estim.record(path, Product(position=Euclidean(("x", "y"), "m"))) as rec:
+        for k in range(20):
+            x += 0.1 * rng.standard_normal(x.shape)
+            rec.stage("predict", states=x)
+            likelihoods = -2 * (z[k] - x[:, 0]) ** 2
+            w = np.exp(likelihoods)
+            rec.stage("weigh", states=x, weights=w, log_likelihoods=likelihoods, z=z[k], sensor="gps")
+            ancestors = np.sort(rng.choice(50, 50, p=w / w.sum()))
+            x[:] = x[ancestors]
+            rec.stage("resample", states=x, log_weights=np.full(50, -3.0), ancestors=ancestors)
+            rec.step(time=0.1 * k, truth=truth[k])
+            means.append(x.mean(0))
+    return np.array(means)
+
+
+def labels(path: Path) -> Array:
+    """A Bayes filter over labels as a person writes it; the probabilities at the end of each step."""
+    p, T, ended = np.ones(3) / 3, 0.85 * np.eye(3) + 0.05, []
+    with viz_estim.record(path, ["calm", "warm", "cold"]) as rec:
+        for k in range(20):
+            p = p @ T
+            rec.stage("predict", probabilities=p, transition=T)
+            likelihoods = np.array([[0.7, 0.2, 0.1], [0.3, 0.5, 0.2]][k % 2])
+            p = p * likelihoods
+            told = dict(zip(("cold", "warm", "calm"), p[::-1], strict=True))
+            rec.stage("update", probabilities=told, log_likelihoods=np.log(likelihoods), z=k % 2, sensor="heat")
+            p /= p.sum()
+            rec.step(time=k, truth="calm" if k < 9 else "warm")
+            ended.append(p)
+    return np.array(ended)
+
+
+def joint(path: Path) -> Array:
+    """A filter with one update of two sensors, that tells all there is; the means at the end of each step."""
+    nav = Product(gps=Euclidean(["x"], "m"), odometer=Euclidean(["v"], "m/s"))
+    rng, (truth, _) = np.random.default_rng(0), readings()
+    x, P, R, means = np.zeros(2), np.eye(2), np.diag([0.25, 0.1]), []
+    with viz_estim.record(path, STATE, sensors={"nav": nav}) as rec:
+        for k in range(60):
+            drawn = x + rng.standard_normal((5, 2))
+            x, P = F @ x, F @ P @ F.T + 0.01 * np.eye(2)
+            rec.stage(
+                "predict", mean=x, cov=P, transition=F, noise=0.01 * np.eye(2), drawn=drawn, propagated=drawn @ F.T
+            )
+            z, expected, used = truth[k] + np.sqrt(np.diag(R)) * rng.standard_normal(2), x, k % 7 > 0
+            S = P + R
+            K = used * P @ np.linalg.inv(S)
+            x, P = x + K @ (z - x), P - K @ S @ K.T
+            rec.stage(
+                "update", mean=x, cov=P, residual=z - expected, residual_cov=S, gain=K, sensor="nav", noise=R,
+                predicted=expected, used=used, sigma=drawn, mapped=drawn, speed=x[1],
+            )  # fmt: skip
+            rec.step(time=0.1 * k, truth=truth[k])
+            means.append(x)
+    return np.array(means)
+
+
+def test_particles_are_told_like_gaussians(tmp_path: Path) -> None:
+    means = cloud(tmp_path / "a.rrd")
+    run = viz_estim.load(tmp_path / "a.rrd")
+    np.testing.assert_allclose(run.mean, means, atol=1e-12)
+    weigh, resample = run.stages["weigh"].values, run.stages["resample"].values
+    np.testing.assert_allclose(np.exp(weigh["log_weights"]).sum(1), 1)
+    np.testing.assert_allclose(weigh["evidence"], np.log(np.exp(weigh["log_likelihoods"]).mean(1)))
+    np.testing.assert_allclose(weigh["ess"], 1 / (np.exp(weigh["log_weights"]) ** 2).sum(1))
+    np.testing.assert_array_equal(resample["ess"], weigh["ess"])
+    before = run.stages["weigh"].values["states"]
+    for row, ancestors in enumerate(resample["ancestors"].astype(int)):
+        np.testing.assert_array_equal(resample["states"][row], before[row][ancestors])
+        assert resample["distinct"][row] == len(set(ancestors.tolist()))
+
+
+def test_labels_are_told_like_gaussians(tmp_path: Path) -> None:
+    ended = labels(tmp_path / "a.rrd")
+    run = viz_estim.load(tmp_path / "a.rrd")
+    assert run.labels == ("calm", "warm", "cold")
+    np.testing.assert_allclose(np.exp(run.ends["log_probabilities"]), ended, atol=1e-12)
+    assert run.truth[:, 0].tolist() == [0] * 9 + [1] * 11
+    assert 0 < run.summary()["metrics"]["accuracy"] < 1
+
+
+def test_an_update_tells_all_that_a_scenario_s_does(tmp_path: Path) -> None:
+    means = joint(tmp_path / "a.rrd")
+    run = viz_estim.load(tmp_path / "a.rrd")
+    np.testing.assert_array_equal(run.mean, means)
+    values = run.stages["update"].values
+    np.testing.assert_array_equal(values["innovation.used"].all(1), np.arange(60) % 7 > 0)
+    np.testing.assert_array_equal(values["innovation.predicted"], run.stages["predict"].mean)
+    np.testing.assert_allclose(values["innovation.z"], values["innovation.predicted"] + values["innovation.residual"])
+    np.testing.assert_array_equal(values["speed"], means[:, 1])
+    assert {"sigma.points", "mapped.points"} <= values.keys()
+    assert {"transition", "noise", "drawn.points"} <= run.stages["predict"].values.keys()
+    assert run.summary()["nis"].keys() == {"gps", "odometer"}
+
+
+KINDS: dict[str, tuple[Callable[[Path], Array], str, str]] = {
+    "particles": (
+        cloud,
+        "break ess < 30\nc\nwhy\nstage back\nwhy\nprint before.std\nprint states[0]\n",
+        "weigh took no",
+    ),
+    "labels": (labels, "break probability[0] > .9\nc\nwhy\nprint log_likelihoods\n", "the readings' log-likelihoods"),
+    "joint": (joint, "break nis.odometer > 2\nc\nwhy\nprint speed\nprint sigma[0]\n", "odometer.v  ν "),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_kind_is_shown_compared_diagnosed_debugged_and_exported(
+    kind: str, cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make, script, words = KINDS[kind]
+    monkeypatch.chdir(tmp_path)
+    make(tmp_path / "a.rrd")
+    for line in ("show a.rrd", "show a.rrd --step 9", "compare a.rrd a.rrd", "export a.rrd --to csv -o a.csv",
+                 "export a.rrd --to npz -o a.npz"):  # fmt: skip
+        done = cli(*line.split())
+        assert (done.code, done.err) == (0, ""), done.err
+    tum = cli("export", "a.rrd", "--to", "tum", "-o", "a.tum")
+    assert tum.code == (0 if kind == "particles" else 2), tum.err
+    diagnosed = cli("diagnose", "a.rrd", "--json")
+    assert (diagnosed.code in (0, 1), diagnosed.err) == (True, "")
+    codes = {one["code"] for one in json.loads(diagnosed.out)["findings"] if one["severity"] == "error"}
+    assert not codes - {"overconfident", "particles_collapsed"}, codes
+    monkeypatch.setattr("sys.stdin", io.StringIO(script + "break finding\ngoto 0\nc\nnames\nset q=1\n"))
+    done = cli("debug", "a.rrd", "--no-viewer")
+    assert (done.code, done.err) == (0, "")
+    assert words in done.out
+    assert done.out.count("error: ") == 1  # that of set
+    assert "  \n" not in done.out
+
+
+def test_a_cloud_without_a_weight_is_kept_as_it_is(cli: Cli, tmp_path: Path) -> None:
+    """The commonest end of a particle filter: no particle explains the reading."""
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        for k in range(4):
+            rec.stage("weigh", states=np.arange(5.0), weights=np.full(5, float(k < 3)))
+            rec.step(time=k)
+    run = viz_estim.load(tmp_path / "a.rrd")
+    assert np.isfinite(run.mean[:3]).all()
+    assert np.isnan(run.mean[3]).all()
+    for arguments in (["show", tmp_path / "a.rrd", "--step", 3], ["diagnose", tmp_path / "a.rrd"]):
+        assert cli(*arguments).code in (0, 1)
+
+
 @pytest.mark.draws
 def test_it_draws(cli: Cli, tmp_path: Path) -> None:
     space = Product(position=Euclidean(("x", "y"), "m"), heading=SO2())
@@ -151,6 +299,14 @@ BAD: dict[str, tuple[Callable[[Any], object], str]] = {
     "a mean of another length": (lambda rec: rec.stage("p", mean=[1, 2, 3], cov=np.eye(2)), "mean: expected"),
     "a cov of another shape": (lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(3)), "cov: expected"),
     "a residual alone": (lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), residual=[1]), "together"),
+    "no belief": (lambda rec: rec.stage("p"), "give mean and cov, or states"),
+    "two beliefs": (lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), states=np.eye(2)), "give mean and cov, or"),
+    "a belief of another kind": (lambda rec: rec.stage("p", states=np.eye(2)), "of another kind than before"),
+    "a number of another shape": (
+        lambda rec: [rec.stage("p", mean=[1, 2], cov=np.eye(2), one=[1]), rec.stage("p", mean=[1, 2], cov=np.eye(2))],
+        "one was of shape (1,) when the stage first came, now none",
+    ),
+    "a number that is a belief": (lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), belief=1), "cannot be a"),
     "a gain that does not fit": (
         lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), residual=[1], residual_cov=1, gain=np.eye(3)),
         "gain: expected the shape (2, 1), got (3, 3)",

@@ -21,9 +21,9 @@ from viz_estim.recording.reader import Run
 def export(run: Run, kind: str, out: Path) -> list[Path]:
     """Writes the run as `kind` and returns the files written; each appears whole or not at all."""
     if kind == "tum":
-        files = {out: run.mean, out.with_name(f"{out.stem}.truth{out.suffix}"): run.truth}
         if run.labels:
             raise BadInput(f"{run.path}: a belief over labels has no trajectory; use --to csv")
+        files = {out: run.mean, out.with_name(f"{out.stem}.truth{out.suffix}"): run.truth}
         return [_write_tum(path, run, states) for path, states in files.items() if np.isfinite(states).any()]
     if kind == "csv":
         names, columns = zip(*_series(run).items(), strict=True)

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from viz_estim.recordings import Names, Recording
+from viz_estim.recordings import Recording
+from viz_estim.told import Names
 
 
 def watch(

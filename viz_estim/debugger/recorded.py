@@ -16,7 +16,7 @@ from viz_estim.debugger.expressions import Absent
 from viz_estim.debugger.quantities import Frame
 from viz_estim.debugger.sources import NoSuchPlace, step_at
 from viz_estim.recording.reader import Run, load
-from viz_estim.recording.tables import StageTable
+from viz_estim.recording.tables import StageTable, is_geometry
 
 _BLOCK = 20_000  # places that a breakpoint is tried on at once
 
@@ -99,7 +99,8 @@ class Recorded:
         for i, table in enumerate(self._tables):
             places = low + np.flatnonzero(kinds == i)
             if len(places):
-                frames.append(self._frame(table.name, places, _Rows(table, self._row[places]), table.spaces))
+                values = _Rows(table, self._row[places], self._geometry_of(table.name), lambda: self.whole)
+                frames.append(self._frame(table.name, places, values, table.spaces))
         return frames
 
     def _frame(self, name: str, places: np.ndarray, values: Mapping[str, Array], spaces: dict[str, Space]) -> Frame:
@@ -128,9 +129,11 @@ class Recorded:
         if (earlier < 0).all():
             return {}
         names = ("log_probabilities",) if self.run.labels else ("mean", "cov")
+        # Of a cloud the moments are kept at the end of each step alone: the others follow from it.
+        tables = list((self.whole if self.run.properties.get("particles") else self.run).stages.values())
         found = {name: np.full((len(places), *self.run.ends[name].shape[1:]), np.nan) for name in names}
         kinds = np.where(earlier >= 0, self._table[earlier], -1)
-        for i, table in enumerate(self._tables):
+        for i, table in enumerate(tables):
             rows = np.flatnonzero(kinds == i)
             for name, values in found.items():
                 values[rows] = table.values[name][self._row[earlier[rows]]]
@@ -153,7 +156,7 @@ class Recorded:
                 found.add(f"{name}.points")
             elif "matches" in what:
                 found |= {f"{name}.{part}" for part in ("source", "target", "distance", "source_index", "target_index")}
-            elif what.get("cloud"):
+            elif what.get("cloud") or is_geometry(name):
                 found.add(name)
         return found
 
@@ -163,19 +166,23 @@ class Recorded:
 
 
 class _Rows(Mapping[str, Array]):
-    """Some rows of a table's numbers, taken when they are asked for."""
+    """Some rows of a table's numbers, taken when they are asked for; sigma points and clouds from the whole run."""
 
-    def __init__(self, table: StageTable, rows: np.ndarray) -> None:
-        self._values, self._rows = table.values, rows
+    def __init__(self, table: StageTable, rows: np.ndarray, geometry: set[str], whole: Callable[[], Run]) -> None:
+        self._table, self._rows, self._geometry, self._whole = table, rows, geometry, whole
 
     def __getitem__(self, name: str) -> Array:
-        return self._values[name][self._rows]
+        table = self._whole().stages[self._table.name] if name in self._geometry else self._table
+        return table.values[name][self._rows]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._table.values or name in self._geometry
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
+        return iter(dict.fromkeys([*self._table.values, *sorted(self._geometry)]))
 
     def __len__(self) -> int:
-        return len(self._values)
+        return len(self._table.values.keys() | self._geometry)
 
 
 class _Row(Mapping[str, Array]):

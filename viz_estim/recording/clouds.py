@@ -45,7 +45,8 @@ class Clouds:
     def take(self, step: Step) -> Step:
         """The step as it is kept: with thinned clouds; notes who descends from whom."""
         for stage in step.stages:
-            if isinstance(stage, Resample) and self._before is not None and step.index % self._every == 0:
+            drawable = self._layout.position and self._before is not None and step.index % self._every == 0
+            if isinstance(stage, Resample) and self._before is not None and drawable:
                 first = np.flatnonzero(np.diff(stage.ancestors, prepend=-1))  # copies stand together
                 chosen = first[:: max(1, -(-len(first) // _LINES))]
                 parents = self._before.states[stage.ancestors[chosen]]
@@ -57,6 +58,8 @@ class Clouds:
         return dataclasses.replace(step, stages=tuple(_thinned(stage) for stage in step.stages))
 
     def add(self, batch: Batch) -> None:
+        if not self._layout.position:  # of something that is nowhere: its numbers and plots are kept alone
+            return
         for rows in batch.stages:
             self._draw(rows)
             if "ancestors" in self._layout.stages[rows.name]:
