@@ -156,19 +156,20 @@ class Recording:
         self._stages, self._readings = [], {}
         self._count += 1
 
-    def fail(self, error: BaseException) -> None:
-        """Ends the run with what was raised, in the step that is not ended."""
+    def fail(self, error: BaseException, stage: str = "") -> None:
+        """Ends the run with what was raised, in the step that is not ended, and in the stage of that name."""
         last = self._stages[-1].name if self._stages else ""
         text = f"{type(error).__name__}: {error}"
-        self._failure = Failure(self._count, f"after {last}" if last else "first", text)
+        self._failure = Failure(self._count, stage or (f"after {last}" if last else "first"), text)
 
     def close(self) -> None:
         """Ends the recording; stages that no step ended are one at the time that would have come next."""
-        if self._stages or (self._failure and self._recorder):
+        untold = self._failure and self._failure.step == self._count
+        if self._stages or (untold and self._recorder):
             gap = self._times[-1] - self._times[-2] if len(self._times) > 1 else 0.0
             time = self._times[-1] + gap if self._times else 0.0
             if not self._stages:
-                self._add(Step(self._count, Tick(time, gap), (), None, self._failure))
+                self._add(Step(self._count, Tick(time, gap, None, dict(self._readings)), (), None, self._failure))
                 self._times.append(time)
                 self._count += 1
             else:
