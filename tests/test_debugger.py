@@ -674,12 +674,6 @@ def viewer() -> Iterator[Viewer]:
         yield started
 
 
-def cursor(viewer: Viewer) -> tuple[str, int | None]:
-    state = viewer._state()
-    (front,) = (one for one in state.recordings if one.store_id == state.active_recording)
-    return str(front.current_timeline), front.current_time
-
-
 @pytest.mark.draws
 def test_the_viewer_s_cursor_stands_where_the_session_does(walk: str, viewer: Viewer) -> None:
     screen = Screen(viewer)
@@ -701,7 +695,7 @@ def test_the_viewer_s_cursor_stands_where_the_session_does(walk: str, viewer: Vi
         began = time.perf_counter()
         session.do(command)
         taken.append(time.perf_counter() - began)
-        assert cursor(viewer) == ("stage", session.place), command
+        assert viewer.cursor() == ("stage", session.place), command
     assert np.median(taken) < 0.5  # 0.2 s where nothing else runs
     os.killpg(viewer._process.pid, signal.SIGKILL)
     errors = io.StringIO()
@@ -730,5 +724,5 @@ def test_a_recording_is_shown_beside_its_session(recording: Path, viewer: Viewer
         "switch 1",
     ]:
         session.do(command)
-        assert cursor(viewer) == ("stage", session.place), command
+        assert viewer.cursor() == ("stage", session.place), command
     session.branches[1].file.close()  # type: ignore[union-attr]

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,24 +63,10 @@ class Screen:
         """Moves the cursor, in the branch's recording."""
         with self._attempt() as viewer:
             if branch in self._locations:
-                viewer._ask(viewer._client.set_location, self._locations[branch])
-            elif self._viewer:
-                self._locations[branch] = self._new_location(self._viewer)
+                viewer.show(self._locations[branch])
+            else:
+                self._locations[branch] = viewer.front(self._locations.values(), _SHOWN_S)
             viewer.seek("stage", place)
-
-    def _new_location(self, viewer: Viewer) -> str:
-        """Of the recording that has just begun, once the viewer shows it."""
-        deadline = time.monotonic() + _SHOWN_S
-        while True:
-            with contextlib.suppress(ViewerError):  # nothing is shown yet
-                state = viewer._state()
-                listed = any(one.store_id == state.active_recording and one.timelines for one in state.recordings)
-                location: str = viewer._ask(viewer._client.get_location) if listed else ""
-                if location and location not in self._locations.values():
-                    return location
-            if not viewer.alive or time.monotonic() > deadline:
-                raise ViewerError("the viewer does not show the recording")
-            time.sleep(0.02)
 
     def leave(self) -> None:
         """Leaves the viewer to the person."""

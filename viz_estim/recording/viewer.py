@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +119,29 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
                         self._ask(self._client.set_time, timeline, sequence=goal[1], play_state="paused")
                         sent, problem = goal, "the cursor did not stay where it was put; try again"
         raise ViewerError(problem)
+
+    def front(self, but: Collection[str] = (), seconds: float = LOAD_S) -> str:
+        """The location of the recording in front, for `show`; waits until it has data and is none of `but`."""
+        for _ in _polls(seconds):
+            with contextlib.suppress(ViewerError):  # nothing is open yet
+                state = self._state()
+                there = any(one.store_id == state.active_recording and one.timelines for one in state.recordings)
+                location: str = self._ask(self._client.get_location) if there else ""
+                if location and location not in but:
+                    return location
+            if not self.alive:
+                raise self._ended()
+        raise ViewerError("the viewer does not show the recording")
+
+    def show(self, location: str) -> None:
+        """Brings a recording to the front."""
+        self._ask(self._client.set_location, location)
+
+    def cursor(self) -> tuple[str | None, int | None]:
+        """The timeline of the recording in front, and where on it the cursor stands: a count, or nanoseconds."""
+        state = self._state()
+        fronts = [one for one in state.recordings if one.store_id == state.active_recording]
+        return (fronts[0].current_timeline, fronts[0].current_time) if fronts else (None, None)
 
     def problems(self) -> list[str]:
         """What views could not draw, and what the viewer warned of since the newest `open`: a line each."""
