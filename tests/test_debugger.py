@@ -22,9 +22,10 @@ from test_survival import FAILING
 import viz_estim
 from viz_estim.core.run import Step, run
 from viz_estim.debugger import branches, findings, forking, recorded
-from viz_estim.debugger.branches import Branch, Screen
+from viz_estim.debugger.branches import Branch
 from viz_estim.debugger.live import Beliefs, Live
 from viz_estim.debugger.recorded import Recorded
+from viz_estim.debugger.screen import Screen
 from viz_estim.debugger.session import Session
 from viz_estim.diagnose import diagnose
 from viz_estim.recording import reader
@@ -694,6 +695,7 @@ def test_the_viewer_s_cursor_stands_where_the_session_does(walk: str, viewer: Vi
     ]:
         began = time.perf_counter()
         session.do(command)
+        assert screen.settle(20)
         taken.append(time.perf_counter() - began)
         assert viewer.cursor() == ("stage", session.place), command
     assert np.median(taken) < 0.5  # 0.2 s where nothing else runs
@@ -701,6 +703,7 @@ def test_the_viewer_s_cursor_stands_where_the_session_does(walk: str, viewer: Vi
     errors = io.StringIO()
     with contextlib.redirect_stderr(errors):
         told = session.do("step", "step 2", "set q=0.3", "step", "switch 1", "step 9", "compare 2")
+        assert screen.settle()
     assert errors.getvalue() == "viz-estim: the viewer is gone; going on without it\n"
     assert not [line for line in told if line.startswith("error")]
     for branch in session.branches:
@@ -724,5 +727,6 @@ def test_a_recording_is_shown_beside_its_session(recording: Path, viewer: Viewer
         "switch 1",
     ]:
         session.do(command)
+        assert screen.settle(20)
         assert viewer.cursor() == ("stage", session.place), command
     session.branches[1].file.close()  # type: ignore[union-attr]

@@ -7,9 +7,10 @@ import re
 from difflib import get_close_matches
 from typing import IO
 
-from viz_estim.debugger.branches import Branch, Screen
+from viz_estim.debugger.branches import Branch
 from viz_estim.debugger.functions import BadExpression
 from viz_estim.debugger.quantities import Frame
+from viz_estim.debugger.screen import Screen
 from viz_estim.debugger.sources import NoSuchPlace
 from viz_estim.errors import BadInput
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from viz_estim.debugger import expressions
-from viz_estim.debugger.branches import Branch, Screen
+from viz_estim.debugger.branches import Branch
 from viz_estim.debugger.breakpoints import Breakpoint
 from viz_estim.debugger.console import Console, Refused, count
 from viz_estim.debugger.expressions import Absent
@@ -18,6 +18,7 @@ from viz_estim.debugger.frame_text import place_text, quantity_text
 from viz_estim.debugger.live import Live
 from viz_estim.debugger.quantities import Frame, Quantity
 from viz_estim.debugger.recorded import Recorded
+from viz_estim.debugger.screen import Screen
 from viz_estim.debugger.sources import NoSuchPlace
 
 _MOMENT = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*(s?)")

@@ -11,7 +11,7 @@ from typing import IO
 import numpy as np
 
 from viz_estim.debugger import branches, forking
-from viz_estim.debugger.branches import Branch, Screen
+from viz_estim.debugger.branches import Branch
 from viz_estim.debugger.console import COMMANDS, Refused, count
 from viz_estim.debugger.differences import side_by_side
 from viz_estim.debugger.frame_text import health_text, names_text, place_text, quantity_text, why_text
@@ -19,6 +19,7 @@ from viz_estim.debugger.functions import FUNCTIONS
 from viz_estim.debugger.live import Live
 from viz_estim.debugger.moving import Moving
 from viz_estim.debugger.recorded import Recorded
+from viz_estim.debugger.screen import Screen
 from viz_estim.debugger.sources import NoSuchPlace
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, whole
