@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from viz_estim.recording.viewer import Viewer, ViewerError
 
-_SHOWN_S = 10.0  # the longest wait until a viewer shows a recording that was begun
+_SHOWN_S = 10.0  # the longest wait until a window shows a recording that was begun, or the place that was asked for
 # A recording's view is sent anew when it comes to know a stage, which puts the cursor back: while it is new, the cursor
 # is looked at again.
 _NEW, _BLUEPRINT_S = 3, 0.15
@@ -81,11 +81,11 @@ class Screen:
                 viewer.show(self._locations[branch])
             else:  # its recording has just begun: it is the one that has come to the front
                 self._locations[branch] = viewer.front(self._locations.values(), _SHOWN_S)
-            viewer.seek("stage", place)
+            viewer.seek("stage", place, _SHOWN_S)
             self._seeks[branch] = self._seeks.get(branch, 0) + 1
             if self._seeks[branch] <= _NEW:
                 time.sleep(_BLUEPRINT_S)
-                viewer.seek("stage", place)
+                viewer.seek("stage", place, _SHOWN_S)
 
         self._ask(_Job(branch, move))
 

@@ -96,13 +96,13 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
             raise ViewerError(f"{path}: has no data on any timeline; is it a recording?")
         self._ask(self._client.set_time, play_state="paused")
 
-    def seek(self, timeline: str, value: float | None = None) -> None:
+    def seek(self, timeline: str, value: float | None = None, seconds: float = SEEK_S) -> None:
         """Moves the front recording's cursor, and waits until it is there; a moment still on its way is waited for.
 
         `step` and `stage` are counted from 0, `time` is in seconds; None is the timeline's end.
         """
         sent, problem = None, "no recording is open; open one first"
-        for _ in _polls(SEEK_S):
+        for _ in _polls(seconds):
             state = self._state()
             for front in [recording for recording in state.recordings if recording.store_id == state.active_recording]:
                 problem = f"no timeline {timeline!r}; choose from: {', '.join(line.name for line in front.timelines)}"
