@@ -428,6 +428,37 @@ def test_a_failure_is_gone_on_from_with_other_parameters(cli: Cli, walk: str, mo
     assert sum(line.startswith("FAILED in after predict: LinAlgError") for line in told) == 3
 
 
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("b 3", "b: back, break, breaks or branches?"), ("wh", "wh: where or why?"),
+        ("continue 3", "continue takes nothing after it"), ("break at", "expected a step such as at 120"),
+        ("break at 1.5", "expected a step such as at 120"), ("break mean.__class__ > 0", "no quantity's name begins with _"),
+        ("print before.foo", "no before.foo; there are before.mean, before.cov"), ("set =1", "expected NAME=VALUE"),
+        ("save recordings/walk-seed1-debug.rrd", "is where branch 1 is being recorded"),
+        ("save 'recordings/walk-seed1-debug.partial.rrd'", "is where branch 1 is being recorded"),
+    ],
+)  # fmt: skip
+def test_a_slip_is_one_line(walk: str, line: str, words: str) -> None:
+    session = Told(live_branch(walk))
+    session.do("step 3")
+    (told,) = session.do(line)
+    assert told.startswith("error: ")
+    assert words in told
+
+
+def test_a_file_that_was_cut_has_whole_steps_alone(recording: Path, tmp_path: Path) -> None:
+    data, opened = recording.read_bytes(), 0
+    for offset in np.random.default_rng(3).integers(1000, len(data), 6):
+        (tmp_path / "cut.rrd").write_bytes(data[:offset])
+        with contextlib.suppress(viz_estim.errors.BadInput):
+            session = Told(branches.of_recording(tmp_path / "cut.rrd", Screen(None)))
+            told = session.do("continue", "where", "why", "back", "stage", "names", "reverse")
+            assert not [line for line in told if "no stage" in line or "Error" in line]
+            opened += 1
+    assert opened
+
+
 def test_abbreviations_repeats_and_the_end(walk: str) -> None:
     session = Told(live_branch(walk), "s\n\n\nbreak at 9\nc\np step\nstag back\nn\nq\nstep 3\n")
     session.loop()

@@ -9,12 +9,11 @@ import numpy as np
 
 from viz_estim.debugger.branches import Branch
 from viz_estim.debugger.live import Live
-from viz_estim.debugger.recorded import Recorded
+from viz_estim.debugger.recorded import Recorded, between
 from viz_estim.debugger.sources import Source
 from viz_estim.differences import first_difference
 from viz_estim.recording.memory import collect
 from viz_estim.recording.reader import Run
-from viz_estim.recording.tables import StageTable
 
 
 def side_by_side(one: Branch, other: Branch) -> str:
@@ -44,27 +43,8 @@ def _run(source: Source, first: int, last: int) -> Run:
     else:
         assert isinstance(source, Recorded)
         clouds = source.run.properties.get("particles")  # whose moments are known from the whole
-        found = _between(source.whole if clouds else source.run, first, last)
+        found = between(source.whole if clouds else source.run, first, last)
     return replace(found, properties=found.properties | {"facts": {}})
-
-
-def _between(run: Run, first: int, last: int) -> Run:
-    """The run's steps from one up to another."""
-    rows = (run.step >= first) & (run.step <= last)
-
-    def cut(table: StageTable) -> StageTable:
-        inside = (table.step >= first) & (table.step <= last)
-        values = {name: value[inside] for name, value in table.values.items()}
-        return replace(table, step=table.step[inside], place=table.place[inside], values=values)
-
-    tables = {name: cut(table) for name, table in run.stages.items()}
-    return replace(
-        run, step=run.step[rows], time=run.time[rows], dt=run.dt[rows], truth=run.truth[rows],
-        inputs={name: value[rows] for name, value in run.inputs.items()},
-        stages={name: table for name, table in tables.items() if len(table.step)},
-        ends={name: value[rows] for name, value in run.ends.items()},
-        error=run.error if last >= run.step[-1] else None,
-    )  # fmt: skip
 
 
 def _figures(run: Run) -> dict[str, float]:

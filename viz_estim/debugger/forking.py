@@ -93,7 +93,7 @@ def changed(parts: list[Part], step: int, settings: list[str], run: Live) -> lis
 def _assigned(plan: Plan, text: str) -> dict[str, Any]:
     name, equals, value = (word.strip() for word in text.partition("="))
     own = parameters(plan.source.scenario)
-    if not equals:
+    if not equals or not name:
         raise BadInput(f"{text}: expected NAME=VALUE")
     if name.startswith("data."):
         raise BadInput(f"{name} belongs to the data: a fork changes the estimator alone; start a new run for it")

@@ -171,7 +171,10 @@ class Moving(Console):
         """break EXPR|stop where it holds: nis.gps > chi2(2, .999); also `at 12.5s`, `at STEP`, `finding`"""
         if not text:
             raise Refused("break where? For example: break nis.gps > chi2(2, .999)")
-        moment = _MOMENT.fullmatch(text[3:].strip()) if text.startswith("at ") else None
+        head, _, rest = text.partition(" ")
+        moment = _MOMENT.fullmatch(rest.strip()) if head == "at" else None
+        if head == "at" and not (moment and (moment[2] or moment[1].isdigit())):
+            raise Refused(f"break {text}: expected a step such as at 120, or a time such as at 12.5s")
         if moment:
             one = Breakpoint(text, None, self._step_of(float(moment[1]), bool(moment[2])))
         else:
@@ -219,7 +222,7 @@ class Moving(Console):
         for name in missing.keys() - known:
             if isinstance(self.branch.source, Recorded):
                 raise Refused(f"no stage has {name}: {missing[name]}")
-            self.say(f"no stage so far has {name}")
+            self.say(f"no stage so far has {name}; {str(missing[name]).rpartition('; ')[2]}")
 
     def _kinds(self) -> Iterable[Frame]:
         """A moment of each kind of stage, as far as they are known."""

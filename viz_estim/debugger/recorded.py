@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from viz_estim.core.spaces import Space
 from viz_estim.debugger.expressions import Absent
 from viz_estim.debugger.quantities import Frame
 from viz_estim.debugger.sources import NoSuchPlace, step_at
+from viz_estim.differences import sound_steps
+from viz_estim.errors import BadInput
 from viz_estim.recording.reader import Run, load
 from viz_estim.recording.tables import StageTable, is_geometry
 
@@ -28,7 +31,7 @@ class Recorded:
     """
 
     def __init__(self, path: Path) -> None:
-        self.run: Run = load(path, points=False)
+        self.run: Run = _whole_steps(load(path, points=False))
         self.findings: dict[int, list[str]] | None = None
         tables = list(self.run.stages.values())
         inside = [np.isin(table.step, self.run.step) for table in tables]  # a kill may have left stages of no step
@@ -146,7 +149,7 @@ class Recorded:
     @cached_property
     def whole(self) -> Run:
         """The recording with its sigma points and clouds."""
-        return load(self.run.path)
+        return _whole_steps(load(self.run.path))
 
     def _geometry_of(self, stage: str) -> set[str]:
         """The names of a stage's sigma points, matches and clouds; a cloud's moments are those that follow from it."""
@@ -163,6 +166,33 @@ class Recorded:
     def _fetched(self, stage: str, rows: np.ndarray) -> dict[str, Array]:
         values = self.whole.stages[stage].values
         return {k: v[rows] for k, v in values.items() if v.dtype == object or not _empty(v[rows])}
+
+
+def _whole_steps(run: Run) -> Run:
+    """The run without the steps of which a kill has left but some stages. BadInput where no step is whole."""
+    count = sound_steps(run) if run.stages or run.complete else 0
+    if not count:
+        raise BadInput(f"{run.path}: it was cut off before its first step was whole")
+    return run if count == len(run.step) else between(run, int(run.step[0]), int(run.step[count - 1]))
+
+
+def between(run: Run, first: int, last: int) -> Run:
+    """The run's steps from one up to another."""
+    rows = (run.step >= first) & (run.step <= last)
+
+    def cut(table: StageTable) -> StageTable:
+        inside = (table.step >= first) & (table.step <= last)
+        values = {name: value[inside] for name, value in table.values.items()}
+        return replace(table, step=table.step[inside], place=table.place[inside], values=values)
+
+    tables = {name: cut(table) for name, table in run.stages.items()}
+    return replace(
+        run, step=run.step[rows], time=run.time[rows], dt=run.dt[rows], truth=run.truth[rows],
+        inputs={name: value[rows] for name, value in run.inputs.items()},
+        stages={name: table for name, table in tables.items() if len(table.step)},
+        ends={name: value[rows] for name, value in run.ends.items()},
+        error=run.error if last >= run.step[-1] else None,
+    )  # fmt: skip
 
 
 class _Rows(Mapping[str, Array]):

@@ -24,7 +24,7 @@ from viz_estim.debugger.sources import NoSuchPlace
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, whole
 from viz_estim.parameters import kind_text, parameters
-from viz_estim.recording.recorder import Recorder
+from viz_estim.recording.recorder import Recorder, partial_of
 from viz_estim.running import plan, recorded
 
 
@@ -160,8 +160,11 @@ class Session(Moving):
         """save FILE|this branch so far as a recording"""
         if not text:
             raise Refused("save where? Give a file that ends in .rrd")
-        path = Path(text)
+        path = Path(text[1:-1] if text[0] in "'\"" and text[-1] == text[0] else text)
         check_writable(path, suffix=".rrd")
+        for branch in self.branches:
+            if branch.file and path.resolve() in (branch.file.path.resolve(), partial_of(branch.file.path).resolve()):
+                raise Refused(f"{path} is where branch {branch.number} is being recorded; choose another name")
         source = self.branch.source
         if isinstance(source, Recorded):
             with whole(path) as aside:
