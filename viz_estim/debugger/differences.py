@@ -56,7 +56,8 @@ def _figures(run: Run) -> dict[str, float]:
 
 
 def _difference(one: Run, other: Run, last: int) -> str:
-    found = first_difference(one, other)
+    with np.errstate(all="ignore"):  # of covariances that are none
+        found = first_difference(one, other)
     if found is None:
         return f"no difference up to step {last}"
     where = f"first difference: step {found.step}, {found.stage}"
