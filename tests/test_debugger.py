@@ -16,17 +16,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import Cli
+from conftest import SHORT, Cli
 from test_survival import FAILING
 
 import viz_estim
 from viz_estim.core.run import Step, run
-from viz_estim.debugger import branches, forking, recorded
-from viz_estim.debugger.branches import Branch, Screen
+from viz_estim.debugger import branches, findings, forking, recorded
+from viz_estim.debugger.branches import Branch
+from viz_estim.debugger.live import Beliefs, Live
 from viz_estim.debugger.recorded import Recorded
+from viz_estim.debugger.screen import Screen
 from viz_estim.debugger.session import Session
-from viz_estim.debugger.sources import Beliefs, Live
+from viz_estim.diagnose import diagnose
 from viz_estim.recording import reader
+from viz_estim.recording.memory import collect
 from viz_estim.recording.reader import Run
 from viz_estim.recording.viewer import Viewer
 from viz_estim.running import Plan, plan
@@ -59,11 +62,14 @@ class Walk:
         innovation = Innovation(Z, z, x, z - x, S, np.full((1, 1), self.r), P, one, one, np.zeros((1, 1)))
         yield Update("update", Gaussian(belief.space, x + K[0] * (z - x), (1 - K) * P), innovation, K)
 
-def walk(rng, *, q: float = 0.1, r: float = 0.25, start: float = 1.0, fails: float = 99.0, noise: float = 0.5):
-    truth = np.cumsum(0.3 * rng.standard_normal((40, 1)), axis=0)
-    z = truth + noise * rng.standard_normal((40, 1))
+def walk(
+    rng, *, q: float = 0.1, r: float = 0.25, start: float = 1.0, fails: float = 99.0, noise: float = 0.5,
+    count: int = 40,
+):
+    truth = np.cumsum(0.3 * rng.standard_normal((count, 1)), axis=0)
+    z = truth + noise * rng.standard_normal((count, 1))
     ticks = [
-        Tick(0.1 * k, 0.1 * (k > 0), measurements={"gps": z[k]} if k % 3 != 1 else {}) for k in range(40)
+        Tick(0.1 * k, 0.1 * (k > 0), measurements={"gps": z[k]} if k % 3 != 1 else {}) for k in range(count)
     ]
     belief = Gaussian(Product(position=Euclidean(["x"], "m")), np.zeros(1), np.full((1, 1), start))
     return Scenario(Walk(q, r, fails), {0: belief}, ticks, truth)
@@ -231,7 +237,7 @@ def random_script(rng: np.random.Generator, length: int) -> str:
     lines = []
     for _ in range(length):
         words = {
-            "k": rng.integers(0, 50), "t": f"{rng.uniform(-1, 6):.3f}", "n": rng.integers(0, 5),
+            "k": rng.integers(0, 30), "t": f"{rng.uniform(-1, 4):.3f}", "n": rng.integers(0, 5),
             "x": f"{rng.normal():.2f}", "y": f"{rng.choice([0.05, 0.3, -1.0]):.2f}", "e": rng.choice(EXPRESSIONS),
             "p": rng.choice(["q", "r", "start", "noise", "fails", "quux"]),
         }  # fmt: skip
@@ -276,7 +282,7 @@ def test_no_script_ends_it_and_every_back_is_exact(
     rng = np.random.default_rng(seed)
     if seed % 20:
         monkeypatch.setattr(branches, "File", NoFile)
-    settings = ["fails=2.5"] if seed % 4 == 0 else []
+    settings = ["count=24", *(["fails=1.5"] if seed % 4 == 0 else [])]
     if seed % 3:
         branch = live_branch(walk, *settings)
     else:
@@ -284,7 +290,7 @@ def test_no_script_ends_it_and_every_back_is_exact(
         if not kept.exists():
             assert cli("run", walk, "--seed", 1, *(f"--set={one}" for one in settings), "--out", kept).code == 0
         branch = branches.of_recording(kept, Screen(None))
-    session = Watching(branch, random_script(rng, 30))
+    session = Watching(branch, random_script(rng, 25))
     session.run()
     told = session.text.getvalue()
     assert session.changed == []
@@ -349,6 +355,53 @@ def test_an_estimator_that_carries_on_more_than_its_belief_is_found_out(tmp_path
     assert told.count("this estimator carries on more than its belief") == 1
 
 
+def test_findings_stop_a_run_that_goes_on_once_the_evidence_is_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(branches, "File", NoFile)
+    session = Told(live_branch("imu-ukf", *SHORT, seed=3))
+    assert session.do("break finding and step > 60")[1].startswith("of a run that goes on, findings are looked for")
+    told = session.do("continue")
+    frozen = session.step
+    assert told[-1].startswith("finding sensor_frozen of gyro")
+    assert session.branch.source.reached > frozen + 50
+    assert all(
+        line.startswith("finding since step ") for line in told[: told.index("breakpoint 1: finding and step > 60")]
+    )
+    session.do("back", "step")  # what is known is told, and stopped at, wherever it is passed again
+    assert session.do("back 9", "continue")[-1] == told[-1]
+    # A branch knows what was known where it parts, and looks on by itself.
+    session.do("set frozen=reject")
+    assert "sensor_frozen" not in str(session._findings())
+    while not session.do("continue")[-1].startswith("error: the run ends here"):
+        pass
+    # At the end it has what a diagnosis of the whole run has.
+    source = session.branch.source
+    assert isinstance(source, Live)
+    assert source.findings
+    assert session.branch.parts
+    known = {(one.code, one.sensor) for _, one in source.findings._known}
+    whole = diagnose(collect(source.scenario, source.steps(), session.branch.parts[-1].plan.all_params()))
+    assert {(one.code, one.sensor) for one in whole} <= known
+
+
+def test_a_finding_that_began_behind_stops_where_the_evidence_is(walk: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Told(live_branch(walk, "noise=9"))
+    session.do("step 7", "break finding")
+    told = session.do("continue")
+    assert told[0].startswith("finding since step 0, before here: overconfident of gps")
+    assert told[-2:] == ["breakpoint 1: finding", "step 39  update  (stage 66)  3.9000 s"]
+    assert any(line.startswith("finding overconfident of gps") for line in session.do("reverse"))
+    session.do("delete 1", "reverse", "continue")
+    assert session._findings() == {}
+    # Whatever a diagnosis does costs no session.
+    with monkeypatch.context() as patch:
+        patch.setattr(findings, "diagnose", lambda run: 1 / 0)
+        told = session.do("break finding", "goto 0", "continue")
+    assert sum("the diagnosis raised ZeroDivisionError" in line for line in told) == 1
+    monkeypatch.setattr(findings, "_MOST", 100)
+    told = Told(live_branch(walk)).do("step", "break finding", "continue", "back", "continue")
+    assert sum("take more than 1 GB" in line for line in told) == 1
+
+
 @pytest.mark.parametrize(("fate", "stage"), [("raises", "predict"), ("is NaN", "correct")])
 def test_post_mortem(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fate: str, stage: str) -> None:
     (tmp_path / "my.py").write_text(FAILING)
@@ -372,6 +425,37 @@ def test_a_failure_is_gone_on_from_with_other_parameters(cli: Cli, walk: str, mo
     assert told[0].startswith("step 26  predict")
     assert "step 39  update  (stage 66)  3.9000 s" in told
     assert sum(line.startswith("FAILED in after predict: LinAlgError") for line in told) == 3
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("b 3", "b: back, break, breaks or branches?"), ("wh", "wh: where or why?"),
+        ("continue 3", "continue takes nothing after it"), ("break at", "expected a step such as at 120"),
+        ("break at 1.5", "expected a step such as at 120"), ("break mean._x > 0", "no quantity's name begins with _"),
+        ("print before.foo", "no before.foo; there are before.mean, before.cov"), ("set =1", "expected NAME=VALUE"),
+        ("save recordings/walk-seed1-debug.rrd", "is where branch 1 is being recorded"),
+        ("save 'recordings/walk-seed1-debug.partial.rrd'", "is where branch 1 is being recorded"),
+    ],
+)  # fmt: skip
+def test_a_slip_is_one_line(walk: str, line: str, words: str) -> None:
+    session = Told(live_branch(walk))
+    session.do("step 3")
+    (told,) = session.do(line)
+    assert told.startswith("error: ")
+    assert words in told
+
+
+def test_a_file_that_was_cut_has_whole_steps_alone(recording: Path, tmp_path: Path) -> None:
+    data, opened = recording.read_bytes(), 0
+    for offset in np.random.default_rng(3).integers(1000, len(data), 6):
+        (tmp_path / "cut.rrd").write_bytes(data[:offset])
+        with contextlib.suppress(viz_estim.errors.BadInput):
+            session = Told(branches.of_recording(tmp_path / "cut.rrd", Screen(None)))
+            told = session.do("continue", "where", "why", "back", "stage", "names", "reverse")
+            assert not [line for line in told if "no stage" in line or "Error" in line]
+            opened += 1
+    assert opened
 
 
 def test_abbreviations_repeats_and_the_end(walk: str) -> None:
@@ -523,24 +607,30 @@ def wait_for(path: Path, seconds: float = 30) -> None:
 def test_killed_at_any_moment_the_branch_s_file_opens(walk: str) -> None:
     code = "import sys; from viz_estim.cli import main; main(sys.argv[1:])"
     arguments = ["debug", walk, "--seed", "1", "--no-viewer"]
+    streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    children = []
     for wait in (0.0, 0.7):
-        streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-        with subprocess.Popen([sys.executable, "-c", code, *arguments], text=True, **streams) as child:  # type: ignore[call-overload]
-            child.stdin.write("step 12\nset q=0.4\nstep 5\n")
-            child.stdin.flush()
-            for line in child.stdout:
-                if line.startswith("step 17"):
-                    break
-            time.sleep(wait)
-            child.send_signal(signal.SIGKILL)
-            child.wait()
-        for path in Path("recordings").glob("*.partial.rrd"):
+        folder = Path(f"after{wait}")
+        folder.mkdir()
+        child = subprocess.Popen([sys.executable, "-c", code, *arguments], text=True, cwd=folder, **streams)  # type: ignore[call-overload]
+        children.append((wait, folder, child))
+        child.stdin.write("step 12\nset q=0.4\nstep 5\n")
+        child.stdin.flush()
+    for wait, folder, child in children:
+        for line in child.stdout:
+            if line.startswith("step 17"):
+                break
+        time.sleep(wait)
+        child.send_signal(signal.SIGKILL)
+        child.communicate()
+        left = list(folder.glob("recordings/*.partial.rrd"))
+        assert len(left) == 2
+        for path in left:
             with contextlib.suppress(viz_estim.errors.BadInput):  # killed before its first second
                 found = viz_estim.load(path)
                 assert not found.complete
                 if wait:
                     assert found.step[-1] == (17 if "-2" in path.name else 12)
-        assert len(list(Path("recordings").glob("*.partial.rrd"))) == 2
 
 
 class Terminal:
@@ -621,12 +711,6 @@ def viewer() -> Iterator[Viewer]:
         yield started
 
 
-def cursor(viewer: Viewer) -> tuple[str, int | None]:
-    state = viewer._state()
-    (front,) = (one for one in state.recordings if one.store_id == state.active_recording)
-    return str(front.current_timeline), front.current_time
-
-
 @pytest.mark.draws
 def test_the_viewer_s_cursor_stands_where_the_session_does(walk: str, viewer: Viewer) -> None:
     screen = Screen(viewer)
@@ -647,13 +731,15 @@ def test_the_viewer_s_cursor_stands_where_the_session_does(walk: str, viewer: Vi
     ]:
         began = time.perf_counter()
         session.do(command)
+        assert screen.settle(20)
         taken.append(time.perf_counter() - began)
-        assert cursor(viewer) == ("stage", session.place), command
+        assert viewer.cursor() == ("stage", session.place), command
     assert np.median(taken) < 0.5  # 0.2 s where nothing else runs
     os.killpg(viewer._process.pid, signal.SIGKILL)
     errors = io.StringIO()
     with contextlib.redirect_stderr(errors):
         told = session.do("step", "step 2", "set q=0.3", "step", "switch 1", "step 9", "compare 2")
+        assert screen.settle()
     assert errors.getvalue() == "viz-estim: the viewer is gone; going on without it\n"
     assert not [line for line in told if line.startswith("error")]
     for branch in session.branches:
@@ -677,5 +763,6 @@ def test_a_recording_is_shown_beside_its_session(recording: Path, viewer: Viewer
         "switch 1",
     ]:
         session.do(command)
-        assert cursor(viewer) == ("stage", session.place), command
+        assert screen.settle(20)
+        assert viewer.cursor() == ("stage", session.place), command
     session.branches[1].file.close()  # type: ignore[union-attr]

@@ -12,11 +12,20 @@ from test_debugger import WALK
 import viz_estim
 from viz_estim.core.run import run
 from viz_estim.debugger import forking
-from viz_estim.debugger.sources import Live
+from viz_estim.debugger.live import Live
 from viz_estim.recording.reader import Run
 from viz_estim.recording.recorder import Recorder
 from viz_estim.running import plan, recorded
 from viz_estim.scenarios import SCENARIOS
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory, cli: Cli) -> Path:
+    """A run of some 310 steps, in which the gyro freezes: many of these tests run it several times."""
+    path = tmp_path_factory.mktemp("fork") / "short.rrd"
+    settings = [f"--set=data.{one}" for one in ("duration=3", "still=1", "freeze=0.5")]
+    assert cli("run", "imu-ukf", *settings, "--seed", 3, "--out", path).code == 0
+    return path
 
 
 def fork(cli: Cli, path: Path, step: int, *settings: str, out: Path) -> Run:
@@ -40,15 +49,15 @@ def assert_same_until(one: Run, other: Run, step: int) -> None:
 
 def test_its_first_steps_are_the_original_s(cli: Cli, recording: Path, tmp_path: Path) -> None:
     original = viz_estim.load(recording)
-    forked = fork(cli, recording, 300, "gyro_noise=0.05", out=tmp_path / "a.rrd")
-    assert_same_until(original, forked, 300)
+    forked = fork(cli, recording, 60, "gyro_noise=0.05", out=tmp_path / "a.rrd")
+    assert_same_until(original, forked, 60)
     assert forked.properties["params"]["gyro_noise"] == 0.05
-    again = fork(cli, tmp_path / "a.rrd", 400, "accel_noise=1", "frozen=reject", out=tmp_path / "b.rrd")
-    assert_same_until(forked, again, 400)
-    assert [part["at"] for part in again.properties["forks"]] == [0, 300, 400]
-    # From 350 on it is a third run, which shares 300 steps with the first and 350 with the second.
-    third = fork(cli, tmp_path / "b.rrd", 350, "accel_noise=1", out=tmp_path / "c.rrd")
-    assert_same_until(forked, third, 350)
+    again = fork(cli, tmp_path / "a.rrd", 90, "accel_noise=1", "frozen=reject", out=tmp_path / "b.rrd")
+    assert_same_until(forked, again, 90)
+    assert [part["at"] for part in again.properties["forks"]] == [0, 60, 90]
+    # From 75 on it is a third run, which shares 60 steps with the first and 75 with the second.
+    third = fork(cli, tmp_path / "b.rrd", 75, "accel_noise=1", out=tmp_path / "c.rrd")
+    assert_same_until(forked, third, 75)
     whole = fork(cli, recording, 0, "initial=truth", out=tmp_path / "d.rrd")
     assert whole.properties["params"]["initial"] == "truth"
     assert (whole.mean[0] != original.mean[0]).any()
@@ -66,7 +75,7 @@ def test_every_scenario_is_found_again_from_its_recording(name: str, tmp_path: P
     made = plan(name, data=None, calibration=None, settings=[], seed=None)
     scenario = made.build()
     with Recorder(tmp_path / "run.rrd", scenario, made.properties(scenario)) as recorder:
-        recorded(islice(run(scenario, made.seed), 30), scenario, recorder, lambda done, total: None)
+        recorded(islice(run(scenario, made.seed), 12), scenario, recorder, lambda done, total: None)
     found = viz_estim.load(tmp_path / "run.rrd")
     forking.check_same(found, forking.live(forking.revive(found)), len(found.step))
 

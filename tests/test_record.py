@@ -102,6 +102,154 @@ def test_it_opens_shows_compares_and_debugs_like_any_other(
     assert (forked.code, forked.err.count("\n")) == (2, 1)
 
 
+def cloud(path: Path) -> Array:
+    """A particle filter of 50 points as a person writes it; the weighted means at the end of each step."""
+    rng, (truth, z) = np.random.default_rng(0), readings()
+    x, means = rng.normal(0, 1, (50, 2)), []
+    with viz_estim.record(path, Product(position=Euclidean(("x", "y"), "m"))) as rec:
+        for k in range(20):
+            x += 0.1 * rng.standard_normal(x.shape)
+            rec.stage("predict", states=x)
+            likelihoods = -2 * (z[k] - x[:, 0]) ** 2
+            w = np.exp(likelihoods)
+            rec.stage("weigh", states=x, weights=w, log_likelihoods=likelihoods, z=z[k], sensor="gps")
+            ancestors = np.sort(rng.choice(50, 50, p=w / w.sum()))
+            x[:] = x[ancestors]
+            rec.stage("resample", states=x, log_weights=np.full(50, -3.0), ancestors=ancestors)
+            rec.step(time=0.1 * k, truth=truth[k])
+            means.append(x.mean(0))
+    return np.array(means)
+
+
+def labels(path: Path) -> Array:
+    """A Bayes filter over labels as a person writes it; the probabilities at the end of each step."""
+    p, T, ended = np.ones(3) / 3, 0.85 * np.eye(3) + 0.05, []
+    with viz_estim.record(path, ["calm", "warm", "cold"]) as rec:
+        for k in range(20):
+            p = p @ T
+            rec.stage("predict", probabilities=p, transition=T)
+            likelihoods = np.array([[0.7, 0.2, 0.1], [0.3, 0.5, 0.2]][k % 2])
+            p = p * likelihoods
+            told = dict(zip(("cold", "warm", "calm"), p[::-1], strict=True))
+            rec.stage("update", probabilities=told, log_likelihoods=np.log(likelihoods), z=k % 2, sensor="heat")
+            p /= p.sum()
+            rec.step(time=k, truth="calm" if k < 9 else "warm")
+            ended.append(p)
+    return np.array(ended)
+
+
+def joint(path: Path) -> Array:
+    """A filter with one update of two sensors, that tells all there is; the means at the end of each step."""
+    nav = Product(gps=Euclidean(["x"], "m"), odometer=Euclidean(["v"], "m/s"))
+    rng, (truth, _) = np.random.default_rng(0), readings()
+    x, P, R, means = np.zeros(2), np.eye(2), np.diag([0.25, 0.1]), []
+    with viz_estim.record(path, STATE, sensors={"nav": nav}) as rec:
+        for k in range(60):
+            drawn = x + rng.standard_normal((5, 2))
+            x, P = F @ x, F @ P @ F.T + 0.01 * np.eye(2)
+            rec.stage(
+                "predict", mean=x, cov=P, transition=F, noise=0.01 * np.eye(2), drawn=drawn, propagated=drawn @ F.T
+            )
+            z, expected, used = truth[k] + np.sqrt(np.diag(R)) * rng.standard_normal(2), x, k % 7 > 0
+            S = P + R
+            K = used * P @ np.linalg.inv(S)
+            x, P = x + K @ (z - x), P - K @ S @ K.T
+            rec.stage(
+                "update", mean=x, cov=P, residual=z - expected, residual_cov=S, gain=K, sensor="nav", noise=R,
+                predicted=expected, used=used, sigma=drawn, mapped=drawn, speed=x[1],
+            )  # fmt: skip
+            rec.step(time=0.1 * k, truth=truth[k])
+            means.append(x)
+    return np.array(means)
+
+
+def test_particles_are_told_like_gaussians(tmp_path: Path) -> None:
+    means = cloud(tmp_path / "a.rrd")
+    run = viz_estim.load(tmp_path / "a.rrd")
+    np.testing.assert_allclose(run.mean, means, atol=1e-12)
+    weigh, resample = run.stages["weigh"].values, run.stages["resample"].values
+    np.testing.assert_allclose(np.exp(weigh["log_weights"]).sum(1), 1)
+    np.testing.assert_allclose(weigh["evidence"], np.log(np.exp(weigh["log_likelihoods"]).mean(1)))
+    np.testing.assert_allclose(weigh["ess"], 1 / (np.exp(weigh["log_weights"]) ** 2).sum(1))
+    np.testing.assert_array_equal(resample["ess"], weigh["ess"])
+    before = run.stages["weigh"].values["states"]
+    for row, ancestors in enumerate(resample["ancestors"].astype(int)):
+        np.testing.assert_array_equal(resample["states"][row], before[row][ancestors])
+        assert resample["distinct"][row] == len(set(ancestors.tolist()))
+
+
+def test_labels_are_told_like_gaussians(tmp_path: Path) -> None:
+    ended = labels(tmp_path / "a.rrd")
+    run = viz_estim.load(tmp_path / "a.rrd")
+    assert run.labels == ("calm", "warm", "cold")
+    np.testing.assert_allclose(np.exp(run.ends["log_probabilities"]), ended, atol=1e-12)
+    assert run.truth[:, 0].tolist() == [0] * 9 + [1] * 11
+    assert 0 < run.summary()["metrics"]["accuracy"] < 1
+
+
+def test_an_update_tells_all_that_a_scenario_s_does(tmp_path: Path) -> None:
+    means = joint(tmp_path / "a.rrd")
+    run = viz_estim.load(tmp_path / "a.rrd")
+    np.testing.assert_array_equal(run.mean, means)
+    values = run.stages["update"].values
+    np.testing.assert_array_equal(values["innovation.used"].all(1), np.arange(60) % 7 > 0)
+    np.testing.assert_array_equal(values["innovation.predicted"], run.stages["predict"].mean)
+    np.testing.assert_allclose(values["innovation.z"], values["innovation.predicted"] + values["innovation.residual"])
+    np.testing.assert_array_equal(values["speed"], means[:, 1])
+    assert {"sigma.points", "mapped.points"} <= values.keys()
+    assert {"transition", "noise", "drawn.points"} <= run.stages["predict"].values.keys()
+    assert run.summary()["nis"].keys() == {"gps", "odometer"}
+
+
+KINDS: dict[str, tuple[Callable[[Path], Array], str, str]] = {
+    "particles": (
+        cloud,
+        "break ess < 30\nc\nwhy\nstage back\nwhy\nprint before.std\nprint states[0]\n",
+        "weigh took no",
+    ),
+    "labels": (labels, "break probability[0] > .9\nc\nwhy\nprint log_likelihoods\n", "the readings' log-likelihoods"),
+    "joint": (joint, "break nis.odometer > 2\nc\nwhy\nprint speed\nprint sigma[0]\n", "odometer.v  ν "),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_kind_is_shown_compared_diagnosed_debugged_and_exported(
+    kind: str, cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make, script, words = KINDS[kind]
+    monkeypatch.chdir(tmp_path)
+    make(tmp_path / "a.rrd")
+    for line in ("show a.rrd", "show a.rrd --step 9", "compare a.rrd a.rrd", "export a.rrd --to csv -o a.csv",
+                 "export a.rrd --to npz -o a.npz"):  # fmt: skip
+        done = cli(*line.split())
+        assert (done.code, done.err) == (0, ""), done.err
+    tum = cli("export", "a.rrd", "--to", "tum", "-o", "a.tum")
+    assert tum.code == (0 if kind == "particles" else 2), tum.err
+    diagnosed = cli("diagnose", "a.rrd", "--json")
+    assert (diagnosed.code in (0, 1), diagnosed.err) == (True, "")
+    codes = {one["code"] for one in json.loads(diagnosed.out)["findings"] if one["severity"] == "error"}
+    assert not codes - {"overconfident", "particles_collapsed"}, codes
+    monkeypatch.setattr("sys.stdin", io.StringIO(script + "break finding\ngoto 0\nc\nnames\nset q=1\n"))
+    done = cli("debug", "a.rrd", "--no-viewer")
+    assert (done.code, done.err) == (0, "")
+    assert words in done.out
+    assert done.out.count("error: ") == 1  # that of set
+    assert "  \n" not in done.out
+
+
+def test_a_cloud_without_a_weight_is_kept_as_it_is(cli: Cli, tmp_path: Path) -> None:
+    """The commonest end of a particle filter: no particle explains the reading."""
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        for k in range(4):
+            rec.stage("weigh", states=np.arange(5.0), weights=np.full(5, float(k < 3)))
+            rec.step(time=k)
+    run = viz_estim.load(tmp_path / "a.rrd")
+    assert np.isfinite(run.mean[:3]).all()
+    assert np.isnan(run.mean[3]).all()
+    for arguments in (["show", tmp_path / "a.rrd", "--step", 3], ["diagnose", tmp_path / "a.rrd"]):
+        assert cli(*arguments).code in (0, 1)
+
+
 @pytest.mark.draws
 def test_it_draws(cli: Cli, tmp_path: Path) -> None:
     space = Product(position=Euclidean(("x", "y"), "m"), heading=SO2())
@@ -151,6 +299,14 @@ BAD: dict[str, tuple[Callable[[Any], object], str]] = {
     "a mean of another length": (lambda rec: rec.stage("p", mean=[1, 2, 3], cov=np.eye(2)), "mean: expected"),
     "a cov of another shape": (lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(3)), "cov: expected"),
     "a residual alone": (lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), residual=[1]), "together"),
+    "no belief": (lambda rec: rec.stage("p"), "give mean and cov, or states"),
+    "two beliefs": (lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), states=np.eye(2)), "give mean and cov, or"),
+    "a belief of another kind": (lambda rec: rec.stage("p", states=np.eye(2)), "of another kind than before"),
+    "a number of another shape": (
+        lambda rec: [rec.stage("p", mean=[1, 2], cov=np.eye(2), one=[1]), rec.stage("p", mean=[1, 2], cov=np.eye(2))],
+        "one was of shape (1,) when the stage first came, now none",
+    ),
+    "a number that is a belief": (lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), belief=1), "cannot be a"),
     "a gain that does not fit": (
         lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), residual=[1], residual_cov=1, gain=np.eye(3)),
         "gain: expected the shape (2, 1), got (3, 3)",
@@ -263,18 +419,127 @@ def test_readings_of_another_size_are_another_sensor_s(tmp_path: Path) -> None:
     assert run.summary()["nis"]["z2"]["dof"] == 2
 
 
-def test_a_filter_that_raises_is_post_mortem(tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", ["update", "predict"])
+def test_a_filter_that_raises_is_post_mortem(
+    method: str, cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     kf = linear()
     rec = viz_estim.watch(kf, path=tmp_path / "a.rrd")
     kf.predict()
     kf.update(1.0)
-    kf.predict()
-    kf.R = kf.R[:, :0]
-    with pytest.raises(ValueError, match="square"):
-        kf.update(1.0)
+    if method == "update":
+        kf.predict()
+        kf.R = kf.R[:, :0]
+    else:
+        kf.F = kf.F[:, :0]
+    with pytest.raises(ValueError, match=r"square|shapes|aligned"):
+        getattr(kf, method)(*([7.0] if method == "update" else []))
     rec.close()
     error = viz_estim.load(tmp_path / "a.rrd").properties["result"]["error"]
-    assert (error["step"], error["stage"]) == (2, "after predict")
+    assert (error["step"], error["stage"]) == (2, method)
+    assert len(viz_estim.load(tmp_path / "a.rrd").step) == 3
+    monkeypatch.setattr("sys.stdin", io.StringIO("where\nback\nstep\n"))
+    told = cli("debug", tmp_path / "a.rrd", "--no-viewer").out.splitlines()
+    assert told[0].startswith("step 2  ")
+    assert told[1].startswith(f"FAILED in {method}: ")
+    assert ("  z.z: 7" in told) == (method == "update")
+    assert any(line.startswith("the last good belief, step ") for line in told)
+
+
+def others() -> dict[str, Any]:
+    """FilterPy's filters beyond the three, by class, each of two components and one reading."""
+    from filterpy.kalman import (
+        CubatureKalmanFilter,
+        EnsembleKalmanFilter,
+        FadingKalmanFilter,
+        IMMEstimator,
+        InformationFilter,
+        MMAEFilterBank,
+        SquareRootKalmanFilter,
+    )
+
+    np.random.seed(0)  # noqa: NPY002 - the ensemble draws from it
+    made: dict[str, Any] = {
+        "square root": SquareRootKalmanFilter(2, 1), "fading": FadingKalmanFilter(1.01, 2, 1),
+        "cubature": CubatureKalmanFilter(2, 1, 0.1, hx=lambda x: x[:1], fx=lambda x, dt: F @ x),
+        "ensemble": EnsembleKalmanFilter(np.zeros(2), np.eye(2), 1, 0.1, 20, lambda x: x[:1], lambda x, dt: F @ x),
+        "models": IMMEstimator([linear(), linear()], [0.5, 0.5], np.array([[0.9, 0.1], [0.1, 0.9]])),
+        "bank": MMAEFilterBank([linear(), linear()], [0.5, 0.5], 2, H=np.array([[1.0, 0.0]])),
+    }  # fmt: skip
+    made["information"] = InformationFilter(2, 1)
+    made["information"].R_inv, made["information"].Q = np.array([[4.0]]), 0.01 * np.eye(2)
+    for name in ("square root", "fading", "information"):
+        made[name].F, made[name].H = F.copy(), np.array([[1.0, 0.0]])
+    for kf in list(made.values())[:4]:
+        kf.Q, kf.R = 0.01 * np.eye(2), np.array([[0.25]])
+    return made
+
+
+@pytest.mark.parametrize("kind", ["square root", "fading", "cubature", "ensemble", "models", "bank", "information"])
+def test_other_filters_of_filterpy_are_watched(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    alone, watched = others()[kind], others()[kind]
+    told = []
+    for kf in (alone, watched):
+        rec = viz_estim.watch(kf, path=tmp_path / "a.rrd", space=STATE) if kf is watched else None
+        np.random.seed(1)  # noqa: NPY002
+        for k in range(12):
+            kf.predict()
+            if k % 3 == 0:
+                kf.update(np.array([0.1 * k]))
+            told.append((np.array(kf.x, float).ravel(), np.array(kf.P)))
+        if rec:
+            rec.close()
+    run = viz_estim.load(tmp_path / "a.rrd")
+    for row in range(12):
+        assert told[row][0].tobytes() == told[12 + row][0].tobytes() == run.mean[1 + row].tobytes()
+        np.testing.assert_array_equal(run.cov[1 + row], told[row][1])
+    keeps = kind in ("square root", "fading", "cubature")
+    assert (run.summary()["nis"].keys() == {"z"}) == keeps
+    assert capsys.readouterr().err.count("keeps no residual") == (not keeps)
+    wanted = {"models": "mu", "bank": "p", "ensemble": "sigma.points", "cubature": "mapped.points"}
+    assert wanted.get(kind, "gain" if keeps else "mean") in run.stages["update"].values
+
+
+def test_sensors_are_told_apart_by_what_they_read(tmp_path: Path) -> None:
+    kf, un = linear(), unscented()
+    rec = viz_estim.watch(kf, path=tmp_path / "a.rrd")
+    other = viz_estim.watch(un, path=tmp_path / "b.rrd")
+    for k in range(12):
+        kf.predict()
+        un.predict(dt=0.5)
+        kf.update(1.0)
+        un.update(1.0)
+        if k % 4 == 0:  # of one component too, at another rate: a speed
+            kf.update(1.0, H=np.array([[0.0, 1.0 + k]]))
+            un.update(1.0, hx=lambda x: x[1:])
+    kf.batch_filter([1.0, 2.0])
+    rec.close()
+    other.close()
+    for name, more in (("a", 2), ("b", 0)):
+        run = viz_estim.load(tmp_path / f"{name}.rrd")
+        stages = {stage: len(table.step) for stage, table in run.stages.items()}
+        assert stages == {"start": 1, "predict": 12 + more, "update": 12 + more, "update_2": 3}
+        assert run.summary()["nis"].keys() == {"z", "z2"}
+    assert run.time[-1] == pytest.approx(6.0)
+    assert {"sigma.points", "mapped.points"} <= run.stages["update"].values.keys()
+
+
+def test_watching_costs_no_program_its_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kf = linear()
+    first = viz_estim.watch(kf, path=tmp_path / "a.rrd")
+    kf.predict()
+    rec = viz_estim.watch(kf, path=tmp_path / "b.rrd")  # as in a notebook: the first has ended
+    kf.predict()
+    kf.x = np.zeros(3)  # of another size: no recording could hold it
+    kf.P, kf.F, kf.Q = np.eye(3), np.eye(3), np.eye(3)
+    kf.predict()
+    kf.predict()
+    rec.close()
+    first.close()
+    assert capsys.readouterr().err.count("\n") == 1
+    assert len(viz_estim.load(tmp_path / "a.rrd").step) == 2
+    assert viz_estim.load(tmp_path / "b.rrd").complete
+    assert "predict" not in vars(kf)
 
 
 def test_one_line_is_all_that_a_person_s_program_needs(tmp_path: Path) -> None:
@@ -296,8 +561,17 @@ for z in range(50):
 
 
 def test_what_cannot_be_watched_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="expected a filter with x, P"):
-        viz_estim.watch(object(), path=tmp_path / "a.rrd")
+    from filterpy.gh import GHFilter  # type: ignore[import-untyped]
+    from filterpy.kalman import FixedLagSmoother
+
+    for wrong, words in (
+        ([object()], "it lacks x, P, predict, update"), ([GHFilter(0, 0, 1, 0.1, 0.1)], "it lacks P, predict"),
+        ([FixedLagSmoother(2, 1)], "it lacks predict, update"), ([], "watch one filter"),
+        ([linear(), linear()], "watch one filter"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            viz_estim.watch(*wrong, path=tmp_path / "a.rrd")
+    assert not list(tmp_path.iterdir())
 
 
 def test_stone_soup_s_predictor_and_updater_are_watched(tmp_path: Path) -> None:
@@ -346,3 +620,56 @@ def test_stone_soup_s_predictor_and_updater_are_watched(tmp_path: Path) -> None:
     before = np.stack([t.mean[i] for t, i in (run.before(run.stages["update"], row) for row in range(20))])  # type: ignore[misc]
     moved = (values["gain"] @ values["innovation.residual"][..., None])[..., 0]
     np.testing.assert_allclose(run.stages["update"].mean - before, moved, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["particles", "unscented"])
+def test_stone_soup_s_other_filters_are_watched(kind: str, tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from stonesoup.models.measurement.nonlinear import (  # type: ignore[import-untyped]
+            CartesianToBearingRange,
+        )
+        from stonesoup.models.transition.linear import (
+            CombinedLinearGaussianTransitionModel,
+            ConstantVelocity,
+        )
+        from stonesoup.predictor.kalman import UnscentedKalmanPredictor
+        from stonesoup.predictor.particle import ParticlePredictor  # type: ignore[import-untyped]
+        from stonesoup.resampler.particle import SystematicResampler  # type: ignore[import-untyped]
+        from stonesoup.types.array import StateVectors  # type: ignore[import-untyped]
+        from stonesoup.types.detection import Detection
+        from stonesoup.types.hypothesis import SingleHypothesis
+        from stonesoup.types.state import GaussianState, ParticleState
+        from stonesoup.updater.kalman import UnscentedKalmanUpdater
+        from stonesoup.updater.particle import ParticleUpdater  # type: ignore[import-untyped]
+    start, rng = datetime.datetime(2024, 1, 1), np.random.default_rng(0)
+    model = CartesianToBearingRange(4, (0, 2), np.diag([0.01, 0.1]))
+    moves = CombinedLinearGaussianTransitionModel([ConstantVelocity(0.05)] * 2)
+    state: Any
+    if kind == "particles":
+        predictor, updater = ParticlePredictor(moves), ParticleUpdater(model, resampler=SystematicResampler())
+        drawn = np.array([[5.0], [1], [5], [1]]) + rng.standard_normal((4, 60))
+        state = ParticleState(StateVectors(drawn), weight=np.full(60, 1 / 60), timestamp=start)
+    else:
+        predictor, updater = UnscentedKalmanPredictor(moves), UnscentedKalmanUpdater(model)
+        state = GaussianState([[5], [1], [5], [1]], np.eye(4), timestamp=start)
+    rec = viz_estim.watch(predictor, updater, path=tmp_path / "a.rrd", space={"x": "m", "vx": "", "y": "m", "vy": ""})
+    ended = []
+    for k in range(1, 10):
+        stamp = start + datetime.timedelta(seconds=0.5 * k)
+        state = predictor.predict(state, timestamp=stamp)
+        z = model.function(GaussianState([[5 + k / 2], [1], [5 + k / 2], [1]], np.eye(4)), noise=True)
+        detection = Detection(z, timestamp=stamp, measurement_model=model)
+        state = updater.update(SingleHypothesis(state, detection))
+        ended.append(np.array(state.mean, float).ravel())
+    with pytest.raises(AttributeError):
+        updater.update(None)
+    rec.close()
+    run = viz_estim.load(tmp_path / "a.rrd")
+    np.testing.assert_allclose(run.mean, ended, atol=1e-9)
+    assert {name: len(table.step) for name, table in run.stages.items()} == {"predict": 9, "update": 9}
+    assert run.properties["result"]["error"]["stage"] == "update"
+    if kind == "unscented":
+        assert run.summary()["nis"]["z"]["dof"] == 2
+    else:
+        assert run.inputs["z.z"].shape == (9, 2)

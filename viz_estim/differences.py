@@ -75,7 +75,7 @@ def first_difference(a: Run, b: Run, tol: float = 1e-9) -> Difference | None:
     0: in units); its covariance, by the relative Frobenius norm; the residual, in σ of its S in a; of labels, the
     largest difference of a probability. tol 0: any bit.
     """
-    rows = paired(a.time[: _sound(a)], b.time[: _sound(b)])
+    rows = paired(a.time[: sound_steps(a)], b.time[: sound_steps(b)])
     pair_of = [_pairs(run, rows[i]) for i, run in enumerate((a, b))]
     found: dict[str, tuple[int, Difference]] = {}  # by stage: the first pair of steps that differs in it
     for name in dict.fromkeys([*a.stages, *b.stages]):
@@ -112,7 +112,7 @@ def first_difference(a: Run, b: Run, tol: float = 1e-9) -> Difference | None:
     return min((one for p, one in found.values() if p == pair), key=lambda one: _place(one.stage, *orders))
 
 
-def _sound(run: Run) -> int:
+def sound_steps(run: Run) -> int:
     """How many steps have all their stages: all, unless the run was killed and the file ends between them."""
     if run.complete or not run.stages:
         return len(run.step)

@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import platform
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -23,37 +22,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from viz_estim.core.beliefs import Gaussian
+from viz_estim import told
+from viz_estim.core.beliefs import Belief, Categorical, Particles
 from viz_estim.core.consistency import Tally
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Failure, Scenario, Step, Tick
 from viz_estim.core.spaces import Euclidean, Product, Space
-from viz_estim.core.stages import Innovation, Stage
+from viz_estim.core.stages import Stage
 from viz_estim.files import check_writable
 from viz_estim.recording.recorder import Recorder
 
-Names = Space | Mapping[str, str] | Sequence[str]
 
-
-@dataclass(frozen=True, slots=True)
-class Corrected(Stage):
-    """An update as a person's own code tells it."""
-
-    innovation: Innovation
-
-
-@dataclass(frozen=True, slots=True)
-class CorrectedByGain(Corrected):
-    """The same with its gain, so that what moved the estimate is known."""
-
-    gain: Array
-
-
-def record(path: str | Path, space: Names | None = None, *, sensors: Mapping[str, Names] | None = None) -> Recording:
+def record(
+    path: str | Path, space: told.Names | None = None, *, sensors: Mapping[str, told.Names] | None = None
+) -> Recording:
     """A recording to be told of stages and steps; a context manager, which ends it.
 
     space: the state's geometry; or its components' names, with their units as a dict; without it they are x0, x1, ….
-    sensors: the same of each sensor's reading, by the name that `stage` calls it.
+    Of a filter over labels it is the labels.
+    sensors: the same of each sensor's reading, by the name that `stage` calls it; a `Product` is a reading of several.
     """
     return Recording(Path(path), space, sensors or {})
 
@@ -66,12 +53,15 @@ class Recording:
 
     made_by = "viz_estim.record"
 
-    def __init__(self, path: Path, space: Names | None, sensors: Mapping[str, Names]) -> None:
+    def __init__(self, path: Path, space: told.Names | None, sensors: Mapping[str, told.Names]) -> None:
         check_writable(path, suffix=".rrd")
         self.path = path
-        self._space = None if space is None else _space(space)
-        self._sensors = {name: _space(names) for name, names in sensors.items()}
-        self._measured: dict[str, Product] = {}  # by stage
+        self._space: Space | None = None if space is None else told.space_of(space)
+        self._labels: tuple[str, ...] = ()
+        self._sensors = {name: told.space_of(names) for name, names in sensors.items()}
+        self._measured: dict[str, tuple[str, Product]] = {}  # by stage: the sensor's name, and its reading
+        self._shapes: dict[str, dict[str, tuple[int, ...]]] = {}  # of a stage's numbers, by stage
+        self._belief: Belief | None = None  # the last
         self._stages: list[Stage] = []
         self._readings: dict[str, Array] = {}
         self._times: list[float] = []
@@ -85,43 +75,66 @@ class Recording:
         self,
         name: str,
         *,
-        mean: ArrayLike,
-        cov: ArrayLike,
+        mean: ArrayLike | None = None,
+        cov: ArrayLike | None = None,
+        states: ArrayLike | None = None,
+        weights: ArrayLike | None = None,
+        log_weights: ArrayLike | None = None,
+        probabilities: ArrayLike | Mapping[str, float] | None = None,
         residual: ArrayLike | None = None,
         residual_cov: ArrayLike | None = None,
         gain: ArrayLike | None = None,
         sensor: str = "z",
         z: ArrayLike | None = None,
+        predicted: ArrayLike | None = None,
         noise: ArrayLike | None = None,
+        used: ArrayLike = True,
+        blind: ArrayLike | None = None,
+        **numbers: ArrayLike,
     ) -> None:
-        """The belief after a stage: mean (n,), cov (d, d). Of an update also the residual (m,), its covariance S (m, m)
-        and the gain (d, m); if known, the reading z and its noise R (m, m).
+        """The belief after a stage: mean (n,) and cov (d, d); or particles' states (N, n) with weights or log_weights
+        (N,); or probabilities (K,) of the labels.
 
-        Without z the reading is recorded as the residual, as if zero had been expected; without the noise R is zero.
-        ValueError where a shape does not fit.
+        Of an update also the residual (m,), its covariance S (m, m) and the gain (d, m); if known, the reading z, what
+        was predicted, the noise R (m, m), whether it was used or gated, and the direction (d,) that it is blind to.
+        Without z and predicted the reading is recorded as the residual, as if zero had been expected; without the noise
+        R is zero. Of a prediction, `noise` is Q (d, d).
+
+        numbers: whatever else the stage has, by name: `transition` F (d, d); `sigma`, `drawn`, `propagated` points
+        (N, n), and `mapped` ones of the reading; `log_likelihoods` (N,) of particles, or (K,) of labels; `ancestors`
+        (N,) of a resampling; a figure of one's own, which is plotted. ValueError where a shape does not fit, or where a
+        stage has other numbers than when it first came.
         """
         if not re.fullmatch(r"[\w-]+", name):
             raise ValueError(f"stage {name!r}: a stage's name is of letters, digits, _ and -")
-        x, P = _vector(mean), _matrix(cov)
-        if self._space is None:
-            self._space = Euclidean([f"x{i}" for i in range(len(x))])
-        n, d = len(self._space.names), len(self._space.axes)
-        _fits(f"stage {name}: mean", x, (n,))
-        _fits(f"stage {name}: cov", P, (d, d))
-        belief = Gaussian(self._space, x, P)
+        where = f"stage {name}"
+        belief = self._believed(where, mean, cov, states, weights, log_weights, probabilities)
+        fields: dict[str, Any] = {}
         if residual is None or residual_cov is None:
             if residual is not None or residual_cov is not None or gain is not None:
-                raise ValueError(f"stage {name}: give residual and residual_cov together, or neither")
-            self._stages.append(Stage(name, belief))
-            return
-        innovation, K = self._innovation(name, sensor, _vector(residual), _matrix(residual_cov), gain, z, noise, d)
-        self._readings[sensor] = innovation.z
-        self._stages.append(
-            Corrected(name, belief, innovation) if K is None else CorrectedByGain(name, belief, innovation, K)
-        )
+                raise ValueError(f"{where}: give residual and residual_cov together, or neither")
+            if noise is not None:
+                numbers["noise"] = noise
+        else:
+            space = self._reading(name, sensor, np.size(np.asarray(residual)))
+            directions = len(told.space_of(belief.space).axes) if not isinstance(belief, Categorical) else 0
+            fields["innovation"], K = told.innovation(
+                where, space, directions, residual, residual_cov,
+                gain=gain, z=z, predicted=predicted, noise=noise, used=used, blind=blind,
+            )  # fmt: skip
+            fields |= {} if K is None else {"gain": K}
+            self._readings |= {part: fields["innovation"].z[at] for part, at in space.at.items()}
+        reading = self._measured[name][1] if name in self._measured else None
+        fields |= told.others(where, belief, self._belief, reading, sensor, z, numbers)
+        if z is not None and sensor not in self._readings and "innovation" not in fields:
+            self._readings[sensor] = told.vector(z)
+        self._check_alike(name, fields)
+        self._space, self._labels = getattr(belief, "space", None), getattr(belief, "labels", ())
+        self._belief = belief
+        self._stages.append(told.stage_of(name, belief, fields))
 
-    def step(self, *, time: float, truth: ArrayLike | None = None, control: ArrayLike | None = None) -> None:
-        """Ends a step at a time (s, not before the last one's), with the true state (n,) where it is known.
+    def step(self, *, time: float, truth: ArrayLike | str | None = None, control: ArrayLike | None = None) -> None:
+        """Ends a step at a time (s, not before the last one's), with the true state (n,), or label, where it is known.
 
         Whether a truth is drawn is settled by the first step: give one there, of NaN if it is not known yet.
         """
@@ -129,30 +142,34 @@ class Recording:
             raise ValueError(f"step {self._count}: its time {time} is not after the last one's")
         if not self._stages:
             raise ValueError(f"step {self._count}: tell of a stage before the step ends")
-        assert self._space is not None
-        true = None if truth is None else _vector(truth)
+        if isinstance(truth, str):
+            if truth not in self._labels:
+                raise ValueError(f"step {self._count}: truth {truth}: expected one of {', '.join(self._labels)}")
+            truth = self._labels.index(truth)
+        true = None if truth is None else told.vector(truth)
         if true is not None:
-            _fits(f"step {self._count}: truth", true, (len(self._space.names),))
+            told.fits(f"step {self._count}: truth", true, (1 if self._space is None else len(self._space.names),))
         dt = time - self._times[-1] if self._times else 0.0
-        tick = Tick(float(time), dt, None if control is None else _vector(control), dict(self._readings))
+        tick = Tick(float(time), dt, None if control is None else told.vector(control), dict(self._readings))
         self._times.append(float(time))
         self._add(Step(self._count, tick, tuple(self._stages), true, self._failure))
         self._stages, self._readings = [], {}
         self._count += 1
 
-    def fail(self, error: BaseException) -> None:
-        """Ends the run with what was raised, in the step that is not ended."""
+    def fail(self, error: BaseException, stage: str = "") -> None:
+        """Ends the run with what was raised, in the step that is not ended, and in the stage of that name."""
         last = self._stages[-1].name if self._stages else ""
         text = f"{type(error).__name__}: {error}"
-        self._failure = Failure(self._count, f"after {last}" if last else "first", text)
+        self._failure = Failure(self._count, stage or (f"after {last}" if last else "first"), text)
 
     def close(self) -> None:
         """Ends the recording; stages that no step ended are one at the time that would have come next."""
-        if self._stages or (self._failure and self._recorder):
+        untold = self._failure and self._failure.step == self._count
+        if self._stages or (untold and self._recorder):
             gap = self._times[-1] - self._times[-2] if len(self._times) > 1 else 0.0
             time = self._times[-1] + gap if self._times else 0.0
             if not self._stages:
-                self._add(Step(self._count, Tick(time, gap), (), None, self._failure))
+                self._add(Step(self._count, Tick(time, gap, None, dict(self._readings)), (), None, self._failure))
                 self._times.append(time)
                 self._count += 1
             else:
@@ -195,10 +212,10 @@ class Recording:
         if step.truth is not None:
             # Two rows, of which one is unknown: a truth that may have gaps, of the parts that this step knows, or of
             # all where it knows none yet.
-            known = step.truth if np.isfinite(step.truth).any() else belief.mean
+            known = step.truth if self._labels or np.isfinite(step.truth).any() else belief.mean
             truth = np.stack([known, np.full(len(known), np.nan)])
         scenario = Scenario(None, {0: belief}, [step.tick], truth)  # type: ignore[arg-type]
-        self._tally = Tally(belief.space)
+        self._tally = Tally(scenario.space)
         properties: dict[str, Any] = {
             "title": self.path.stem,
             "scenario": self.path.stem,
@@ -213,56 +230,50 @@ class Recording:
         }
         self._recorder = Recorder(self.path, scenario, properties)
 
-    def _innovation(
-        self, stage: str, sensor: str, residual: Array, S: Array, gain: ArrayLike | None, z: ArrayLike | None,
-        noise: ArrayLike | None, d: int,
-    ) -> tuple[Innovation, Array | None]:  # fmt: skip
-        m = len(residual)
+    def _believed(
+        self, where: str, mean: ArrayLike | None, cov: ArrayLike | None, states: ArrayLike | None,
+        weights: ArrayLike | None, log_weights: ArrayLike | None, probabilities: ArrayLike | Mapping[str, float] | None,
+    ) -> Belief:  # fmt: skip
+        """The belief, of the kind that the recording began with."""
+        kinds = [mean is not None or cov is not None, states is not None, probabilities is not None]
+        if sum(kinds) != 1:
+            raise ValueError(f"{where}: give mean and cov, or states (of particles), or probabilities (of labels)")
+        belief: Belief
+        if probabilities is not None:
+            plain = tuple(self._space.names) if self._space is not None and self._belief is None else self._labels
+            belief = told.categorical(where, plain, probabilities)
+        elif states is not None:
+            belief = told.particles(where, self._space, states, weights, log_weights)
+        elif mean is None or cov is None:
+            raise ValueError(f"{where}: give mean and cov together")
+        else:
+            belief = told.gaussian(where, self._space, mean, cov)
+        if self._belief is not None and (type(belief), belief.shapes) != (type(self._belief), self._belief.shapes):
+            if isinstance(belief, Particles) and isinstance(self._belief, Particles):
+                now, then = (len(one.log_weights) for one in (belief, self._belief))
+                raise ValueError(f"{where}: {now} particles, but {then} before: a recording holds one number of them")
+            raise ValueError(f"{where}: the belief is of another kind than before")
+        return belief
+
+    def _reading(self, stage: str, sensor: str, m: int) -> Product:
+        """The space of a stage's reading: named, or of as many components as it has."""
         if stage not in self._measured:
             names = self._sensors.get(sensor) or Euclidean([f"{sensor}{i}" for i in range(m)] if m > 1 else [sensor])
-            self._measured[stage] = Product(**{sensor: names})
-        space = self._measured[stage]
-        if sensor not in space.parts:
-            raise ValueError(
-                f"stage {stage}: its reading was {next(iter(space.parts))}; name a {sensor}'s update otherwise"
-            )
-        size = len(space.axes)
-        _fits(f"stage {stage}: residual", residual, (size,))
-        _fits(f"stage {stage}: residual_cov", S, (size, size))
-        K = None if gain is None else _matrix(gain, (d, size))
-        if K is not None:
-            _fits(f"stage {stage}: gain", K, (d, size))
-        R = np.zeros((size, size)) if noise is None else _matrix(noise)
-        _fits(f"stage {stage}: noise", R, (size, size))
-        reading = residual if z is None else _vector(z)
-        flat = len(reading) == size
-        predicted = reading - residual if flat else reading
-        yes = np.ones(1, bool)
-        C = np.zeros((d, size)) if K is None else K @ S
-        return Innovation(space, reading, predicted, residual, S, R, C, yes, yes, np.zeros((d, 1))), K
+            self._measured[stage] = sensor, names if isinstance(names, Product) else Product(**{sensor: names})
+        known, space = self._measured[stage]
+        if known != sensor:
+            raise ValueError(f"stage {stage}: its reading was {known}; name a {sensor}'s update otherwise")
+        return space
 
-
-def _space(names: Names) -> Space:
-    if isinstance(names, Mapping):
-        return Euclidean(list(names), list(names.values()))
-    if isinstance(names, Sequence):
-        return Euclidean(names)
-    return names
-
-
-def _vector(values: ArrayLike) -> Array:
-    """A copy (n,) of a vector, a column, or one number."""
-    return np.array(values, float).reshape(-1)
-
-
-def _matrix(values: ArrayLike, shape: tuple[int, int] | None = None) -> Array:
-    """A copy as a matrix; one number is 1 × 1, and a vector a row or column where the shape asks for it."""
-    found = np.array(values, float)
-    if shape and found.size == shape[0] * shape[1] and found.ndim < 2:
-        return found.reshape(shape)
-    return np.atleast_2d(found)
-
-
-def _fits(what: str, values: Array, shape: tuple[int, ...]) -> None:
-    if values.shape != shape:
-        raise ValueError(f"{what}: expected the shape {shape}, got {values.shape}")
+    def _check_alike(self, stage: str, fields: dict[str, Any]) -> None:
+        """ValueError unless a stage has the same numbers each time: they are columns of one table."""
+        shapes = {name: np.shape(getattr(value, "points", value)) for name, value in fields.items()}
+        known = self._shapes.setdefault(stage, shapes)
+        for name in known.keys() | shapes.keys():
+            if known.get(name) != shapes.get(name):
+                was = "has none" if name not in known else f"was of shape {known[name]}"
+                now = "none" if name not in shapes else f"one of shape {shapes[name]}"
+                raise ValueError(
+                    f"stage {stage}: {name} {was} when the stage first came, now {now}; give it the same each time, or "
+                    "call this stage by another name"
+                )

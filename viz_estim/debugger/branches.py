@@ -4,9 +4,6 @@ recorded as it goes, so that a kill leaves its file, and a viewer shows it."""
 from __future__ import annotations
 
 import contextlib
-import sys
-import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,102 +11,11 @@ from typing import Any
 from viz_estim.core.consistency import Tally
 from viz_estim.core.run import Step
 from viz_estim.debugger.forking import Part, properties
+from viz_estim.debugger.live import Live
 from viz_estim.debugger.recorded import Recorded
-from viz_estim.debugger.sources import Live, Source
-from viz_estim.recording.recorder import Recorder
-from viz_estim.recording.viewer import Viewer, ViewerError
-
-_SHOWN_S = 5.0  # the longest wait until a viewer shows a recording that was begun
-
-
-class Screen:
-    """The viewer beside a session, as long as there is one; what becomes of it is told once."""
-
-    def __init__(self, viewer: Viewer | None) -> None:
-        self._viewer = viewer
-        self._locations: dict[int, str] = {}  # by branch
-        self._behind = False  # told that the cursor did not follow
-
-    @classmethod
-    def start(cls) -> Screen:
-        """A viewer's window, or none and a word about it where it cannot be had."""
-        try:
-            return cls(Viewer.start(headless=False))
-        except ViewerError as error:
-            _tell(f"going on without a viewer: {error}")
-            return cls(None)
-
-    @property
-    def url(self) -> str | None:
-        """Where recordings are streamed to."""
-        if self._viewer and not self._viewer.alive:
-            self.lose()
-        return self._viewer.url if self._viewer else None
-
-    def lose(self) -> None:
-        """The viewer is gone, or does not answer."""
-        if self._viewer:
-            with contextlib.suppress(Exception):
-                self._viewer.close()
-            self._viewer = None
-            _tell("the viewer is gone; going on without it")
-
-    def open(self, path: Path) -> None:
-        """Shows a recording."""
-        with self._attempt() as viewer:
-            viewer.open(path)
-
-    def seek(self, branch: int, place: int) -> None:
-        """Moves the cursor, in the branch's recording."""
-        with self._attempt() as viewer:
-            if branch in self._locations:
-                viewer._ask(viewer._client.set_location, self._locations[branch])
-            elif self._viewer:
-                self._locations[branch] = self._new_location(self._viewer)
-            viewer.seek("stage", place)
-
-    def _new_location(self, viewer: Viewer) -> str:
-        """Of the recording that has just begun, once the viewer shows it."""
-        deadline = time.monotonic() + _SHOWN_S
-        while True:
-            with contextlib.suppress(ViewerError):  # nothing is shown yet
-                state = viewer._state()
-                listed = any(one.store_id == state.active_recording and one.timelines for one in state.recordings)
-                location: str = viewer._ask(viewer._client.get_location) if listed else ""
-                if location and location not in self._locations.values():
-                    return location
-            if not viewer.alive or time.monotonic() > deadline:
-                raise ViewerError("the viewer does not show the recording")
-            time.sleep(0.02)
-
-    def leave(self) -> None:
-        """Leaves the viewer to the person."""
-        if self._viewer:
-            self._viewer.detach()
-            self._viewer = None
-
-    @contextlib.contextmanager
-    def _attempt(self) -> Iterator[Any]:
-        """A context whose failure costs the viewer, not the session. Without a viewer nothing in it is done."""
-        try:
-            yield self._viewer or _Nobody()
-        except ViewerError as error:
-            if self._viewer and self._viewer.alive:  # it is slow, or shows something else: the next stop may do better
-                if not self._behind:
-                    _tell(f"the viewer's cursor did not follow ({error})")
-                self._behind = True
-            else:
-                self.lose()
-
-
-class _Nobody:
-    """Stands for a viewer that is not there: takes every call."""
-
-    def __getattr__(self, name: str) -> Any:
-        return self
-
-    def __call__(self, *arguments: object) -> str:
-        return ""
+from viz_estim.debugger.screen import Screen
+from viz_estim.debugger.sources import Source
+from viz_estim.recording.recorder import Recorder, partial_of
 
 
 class File:
@@ -149,9 +55,7 @@ class File:
         """Begins again, without the viewer; the steps so far are done again."""
         with contextlib.suppress(Exception):
             self._recorder.abort()
-        self._recorder.partial.unlink(
-            missing_ok=True
-        )  # the severed stream may still hold it, and must not write into ours
+        self._recorder.partial.unlink(missing_ok=True)  # the severed stream may hold it, and must not write into ours
         self._begin()
         for step in self._source.steps():
             self._take(step)
@@ -159,11 +63,18 @@ class File:
     def _begin(self) -> None:
         last = self._parts[-1]
         scenario = last.scenario
-        url = self._screen.url
-        self._watched = url is not None
         self._tally = Tally(scenario.space, max(scenario.beliefs), scenario.facts)
         self._count = self._stages = 0
-        self._recorder = Recorder(self.path, scenario, properties(self._parts), live=url)
+        url = self._screen.url
+        self._watched = url is not None
+        try:
+            self._recorder = Recorder(self.path, scenario, properties(self._parts), live=url)
+        except RuntimeError:  # the viewer has just gone
+            if not self._watched:
+                raise
+            self._screen.lose()
+            partial_of(self.path).unlink(missing_ok=True)  # as above
+            self._begin()
 
     def _take(self, step: Step) -> None:
         if step.index < self._count:  # taken already, with those before it, when the file was begun again
@@ -215,7 +126,3 @@ def of_parts(number: int, about: str, parts: list[Part], source: Live, screen: S
         file.add(step)
     source.told = file.add
     return Branch(number, about, last.first, parent, source, parts, file)
-
-
-def _tell(text: str) -> None:
-    print(f"viz-estim: {text}", file=sys.stderr, flush=True)

@@ -7,17 +7,21 @@ import re
 from difflib import get_close_matches
 from typing import IO
 
-from viz_estim.debugger.branches import Branch, Screen
+from viz_estim.debugger.branches import Branch
 from viz_estim.debugger.functions import BadExpression
 from viz_estim.debugger.quantities import Frame
+from viz_estim.debugger.screen import Screen
 from viz_estim.debugger.sources import NoSuchPlace
 from viz_estim.errors import BadInput
 
-# The order is the help's; of several commands that a beginning fits, the first is meant.
+# In the help's order.
 COMMANDS = (
     "step", "back", "stage", "goto", "continue", "reverse", "break", "breaks", "delete", "print", "display", "names",
     "where", "why", "set", "branches", "switch", "compare", "save", "quit", "help",
 )  # fmt: skip
+
+# What a beginning means that fits several; any other such beginning is asked back.
+SHORT = {"s": "step", "c": "continue", "r": "reverse", "p": "print", "d": "display", "w": "where", "n": "names"}
 
 
 class Refused(ValueError):
@@ -70,7 +74,7 @@ class Console(cmd.Cmd):
             self.say(f"error: {_one_line(error)}")
         except KeyboardInterrupt:
             self.say("interrupted")
-        except Exception as error:  # whatever it is, it must not cost the session
+        except (Exception, SystemExit) as error:  # whatever it is, of a person's filter too: it costs no session
             self.say(f"error: {type(error).__name__}: {_one_line(error)}")
         return False
 
@@ -83,12 +87,26 @@ class Console(cmd.Cmd):
         if not line:
             return line
         head, *rest = line.split(None, 1)
-        name = "help" if head == "?" else next((n for n in COMMANDS if n == head), None)
-        name = name or next((n for n in COMMANDS if n.startswith(head)), None)
-        if name is None:
+        name = "help" if head == "?" else self._meant(head)
+        usage = (getattr(self, f"do_{name}").__doc__ or "").partition("|")[0]
+        if rest and usage == name:
+            raise Refused(f"{name} takes nothing after it")
+        return " ".join([name, *rest])
+
+    def _meant(self, head: str) -> str:
+        """The command of that name, or with that beginning."""
+        fitting = [name for name in COMMANDS if name.startswith(head)]
+        if head in fitting:
+            return head
+        if head in SHORT:
+            return SHORT[head]
+        if not fitting:
             close = get_close_matches(head, COMMANDS, n=1, cutoff=0.5)
             raise Refused(f"no command {head}; {f'did you mean {close[0]}?' if close else '`help` lists them'}")
-        return " ".join([name, *rest])
+        shortest = min(fitting, key=len)
+        if not all(name.startswith(shortest) for name in fitting):  # as `bre` is break, not breaks
+            raise Refused(f"{head}: {', '.join(fitting[:-1])} or {fitting[-1]}?")
+        return shortest
 
 
 def count(text: str) -> int:
@@ -98,5 +116,5 @@ def count(text: str) -> int:
     return int(text) if text else 1
 
 
-def _one_line(error: Exception) -> str:
+def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())

@@ -105,7 +105,9 @@ _COMPARISONS: dict[type[ast.AST], Callable[..., Any]] = {
 
 def _check(node: ast.expr) -> None:
     """BadExpression at the first thing that no expression may do."""
-    if name_of(node) is not None:
+    if (name := name_of(node)) is not None:
+        if any(part.startswith("_") for part in name.split(".")):
+            raise BadExpression(f"{name}: no quantity's name begins with _")
         return
     if isinstance(node, ast.Attribute):
         raise BadExpression(f"{_shown(node)}: only quantities have parts; .{node.attr} is none of one")

@@ -12,7 +12,7 @@ import numpy as np
 
 from viz_estim.core.beliefs import Belief, Particles
 from viz_estim.core.run import Scenario, Tick, run
-from viz_estim.debugger.sources import Live
+from viz_estim.debugger.live import Live
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, sha256
 from viz_estim.parameters import nearest, parameters
@@ -93,7 +93,7 @@ def changed(parts: list[Part], step: int, settings: list[str], run: Live) -> lis
 def _assigned(plan: Plan, text: str) -> dict[str, Any]:
     name, equals, value = (word.strip() for word in text.partition("="))
     own = parameters(plan.source.scenario)
-    if not equals:
+    if not equals or not name:
         raise BadInput(f"{text}: expected NAME=VALUE")
     if name.startswith("data."):
         raise BadInput(f"{name} belongs to the data: a fork changes the estimator alone; start a new run for it")

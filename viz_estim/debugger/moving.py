@@ -2,39 +2,26 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from viz_estim.debugger import expressions
-from viz_estim.debugger.branches import Branch, Screen
+from viz_estim.debugger.branches import Branch
+from viz_estim.debugger.breakpoints import Breakpoint
 from viz_estim.debugger.console import Console, Refused, count
 from viz_estim.debugger.expressions import Absent
+from viz_estim.debugger.findings import HOW, Findings, of_run
 from viz_estim.debugger.frame_text import place_text, quantity_text
+from viz_estim.debugger.live import Live
 from viz_estim.debugger.quantities import Frame, Quantity
 from viz_estim.debugger.recorded import Recorded
-from viz_estim.debugger.sources import Live, NoSuchPlace
+from viz_estim.debugger.screen import Screen
+from viz_estim.debugger.sources import NoSuchPlace
 
 _MOMENT = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*(s?)")
-
-
-@dataclass(frozen=True)
-class Breakpoint:
-    """Holds wherever its expression is true; without one, at the first stage of a step."""
-
-    text: str
-    tree: ast.expr | None
-    step: int = 0
-
-    def holds(self, frame: Frame) -> np.ndarray:
-        """Where (M,), of a frame of M moments."""
-        if self.tree is None:
-            return np.asarray((frame.step == self.step) & (frame.index == 0))
-        return np.broadcast_to(expressions.holds(self.tree, frame.lookup), frame.step.shape)
 
 
 class Moving(Console):
@@ -45,7 +32,7 @@ class Moving(Console):
         self._breaks: dict[int, Breakpoint] = {}
         self._count = 0
         self.displayed: list[str] = []
-        self._warned = False
+        self._warned: set[str] = set()
 
     def do_step(self, text: str) -> None:
         """step [N]|N steps on, to the end of that step"""
@@ -75,7 +62,8 @@ class Moving(Console):
 
     def do_continue(self, text: str) -> None:
         """continue|on to the next place where a breakpoint holds, else to the end"""
-        source, before = self.branch.source, self.branch.source.reached
+        self._look_for_findings()
+        source, before, known = self.branch.source, self.branch.source.reached, self._findings()
         try:
             hit = self._first(source.ahead(self.place), last=False)
         except KeyboardInterrupt:
@@ -84,10 +72,18 @@ class Moving(Console):
                 self.go(source.span(source.reached)[-1])
                 return
             raise
-        self._stop_at(hit, source.span(source.reached)[-1], f"the run ends here{self._ended()}")
+        end = source.span(source.reached)[-1]
+        for step, texts in self._findings().items():
+            if source.span(step)[-1] <= self.place:
+                for text in texts[len(known.get(step, [])) :]:
+                    self.say(f"finding since step {step}, before here: {text}")
+        if hit and hit[0] <= self.place:  # it is one of these: here is where the evidence is in
+            hit = end, hit[1]
+        self._stop_at(hit, end, f"the run ends here{self._ended()}")
 
     def do_reverse(self, text: str) -> None:
         """reverse|back to the last place where a breakpoint held, else to the start"""
+        self._look_for_findings()
         hit = self._first(self.branch.source.behind(self.place), last=True)
         self._stop_at(hit, 0, "this is the run's first stage")
 
@@ -113,7 +109,7 @@ class Moving(Console):
                     for place in frame.place[one.holds(frame)].tolist():
                         hits.setdefault(place, []).append(number)
             if hits:
-                place = max(hits) if last else min(hits)
+                place = max(hits) if last else min(hits, key=lambda place: (place <= self.place, place))
                 return place, hits[place]
         return None
 
@@ -136,16 +132,27 @@ class Moving(Console):
     def stop(self) -> None:
         """Tells where it is, shows what is displayed, moves the viewer's cursor."""
         self.say(place_text(self.frame) + self.failed())
-        source, step = self.branch.source, self.step
-        if isinstance(source, Recorded) and source.findings and self.place == source.span(step)[-1]:
-            for text in source.findings.get(step, []):
+        source = self.branch.source
+        if self.place == source.span(self.step)[-1]:
+            for text in self._findings().get(self.step, []):
                 self.say(f"finding {text}")
         for text in self.displayed:
             self.say(self.displayable(text))
-        if isinstance(source, Live) and not source.forgetful and not self._warned:
-            self._warned = True
-            self.say("this estimator carries on more than its belief: a step done again comes out different")
+        if isinstance(source, Live):
+            self._warn(source)
         self.screen.seek(self.branch.number, self.place)
+
+    def _warn(self, source: Live) -> None:
+        """Tells once what a person should know of a run that goes on."""
+        words = []
+        if not source.forgetful:
+            words.append("this estimator carries on more than its belief: a step done again comes out different")
+        if source.findings and source.findings.given_up:
+            words.append(f"findings are looked for no longer: {source.findings.given_up}")
+        for text in words:
+            if text not in self._warned:
+                self._warned.add(text)
+                self.say(text)
 
     def failed(self) -> str:
         """A line on what ended the run, where it stands at that place."""
@@ -164,17 +171,21 @@ class Moving(Console):
         """break EXPR|stop where it holds: nis.gps > chi2(2, .999); also `at 12.5s`, `at STEP`, `finding`"""
         if not text:
             raise Refused("break where? For example: break nis.gps > chi2(2, .999)")
-        moment = _MOMENT.fullmatch(text[3:].strip()) if text.startswith("at ") else None
+        head, _, rest = text.partition(" ")
+        moment = _MOMENT.fullmatch(rest.strip()) if head == "at" else None
+        if head == "at" and not (moment and (moment[2] or moment[1].isdigit())):
+            raise Refused(f"break {text}: expected a step such as at 120, or a time such as at 12.5s")
         if moment:
             one = Breakpoint(text, None, self._step_of(float(moment[1]), bool(moment[2])))
         else:
             one = Breakpoint(text, expressions.parse(text))
-            if "finding" in expressions.names_in(expressions.parse(text)):
-                self._diagnose()
+            self._look_for_findings(one)
             self._try(one)
         self._count += 1
         self._breaks[self._count] = one
         self.say(f"breakpoint {self._count}: {text}")
+        if one.of_findings and isinstance(self.branch.source, Live):
+            self.say(HOW)
 
     def do_breaks(self, text: str) -> None:
         """breaks|lists them"""
@@ -211,7 +222,7 @@ class Moving(Console):
         for name in missing.keys() - known:
             if isinstance(self.branch.source, Recorded):
                 raise Refused(f"no stage has {name}: {missing[name]}")
-            self.say(f"no stage so far has {name}")
+            self.say(f"no stage so far has {name}; {str(missing[name]).rpartition('; ')[2]}")
 
     def _kinds(self) -> Iterable[Frame]:
         """A moment of each kind of stage, as far as they are known."""
@@ -220,18 +231,26 @@ class Moving(Console):
             return source.one_of_each()
         return [source.frame(place) for k in {0, self.step, source.reached} for place in source.span(k)]
 
-    def _diagnose(self) -> None:
-        """Has the recording diagnosed, once."""
+    def _look_for_findings(self, *also: Breakpoint) -> None:
+        """Has this branch diagnosed, where a breakpoint asks for findings: a recording at once, a run as it goes on."""
         source = self.branch.source
-        if not isinstance(source, Recorded):
-            raise Refused("findings are of a recording: save this run, and debug the file")
-        if source.findings is None:
-            from viz_estim.diagnose import diagnose
+        wanted = any(one.of_findings for one in (*self._breaks.values(), *also))
+        if isinstance(source, Recorded):
+            if wanted and source.findings is None:
+                source.findings = of_run(source.whole)
+        elif isinstance(source, Live):
+            assert self.branch.parts
+            if not wanted:
+                source.findings = None
+            elif source.findings is None:
+                source.look(Findings(source.scenario, self.branch.parts[-1].plan.all_params()))
 
-            source.findings = {}
-            for one in diagnose(source.whole):
-                about = f"{one.code}{f' of {one.sensor}' if one.sensor else ''}: {one.cause}"
-                source.findings.setdefault(one.steps[0], []).append(about)
+    def _findings(self) -> dict[int, list[str]]:
+        """What is known to be found, by the step at which it begins."""
+        source = self.branch.source
+        if isinstance(source, Recorded):
+            return source.findings or {}
+        return dict(source.findings.begins) if isinstance(source, Live) and source.findings else {}
 
     # What is displayed.
 

@@ -89,8 +89,15 @@ class Frame:
         if name not in self._known:
             head, dot, rest = name.partition(".")
             if head == "before" and dot:
-                before = replace(self, values=self.before(), spaces={}, inputs={}, findings=None, _known={})
-                self._known[name] = before.quantity(rest)
+                before = replace(
+                    self, values=self.before(), spaces={}, inputs={}, findings=None, _known={}, before=_nothing
+                )
+                try:
+                    self._known[name] = before.quantity(rest)
+                except Absent as error:
+                    known = [f"before.{one}" for one in before.values]
+                    hint = f"there are {', '.join(known)}" if known else "nothing came before this stage"
+                    raise Absent(f"no {name}; {hint}") from error
             else:
                 self._known[name] = self._found(name)
         return self._known[name]

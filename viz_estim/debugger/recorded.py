@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,10 @@ from viz_estim.core.spaces import Space
 from viz_estim.debugger.expressions import Absent
 from viz_estim.debugger.quantities import Frame
 from viz_estim.debugger.sources import NoSuchPlace, step_at
+from viz_estim.differences import sound_steps
+from viz_estim.errors import BadInput
 from viz_estim.recording.reader import Run, load
-from viz_estim.recording.tables import StageTable
+from viz_estim.recording.tables import StageTable, is_geometry
 
 _BLOCK = 20_000  # places that a breakpoint is tried on at once
 
@@ -28,7 +31,7 @@ class Recorded:
     """
 
     def __init__(self, path: Path) -> None:
-        self.run: Run = load(path, points=False)
+        self.run: Run = _whole_steps(load(path, points=False))
         self.findings: dict[int, list[str]] | None = None
         tables = list(self.run.stages.values())
         inside = [np.isin(table.step, self.run.step) for table in tables]  # a kill may have left stages of no step
@@ -99,7 +102,8 @@ class Recorded:
         for i, table in enumerate(self._tables):
             places = low + np.flatnonzero(kinds == i)
             if len(places):
-                frames.append(self._frame(table.name, places, _Rows(table, self._row[places]), table.spaces))
+                values = _Rows(table, self._row[places], self._geometry_of(table.name), lambda: self.whole)
+                frames.append(self._frame(table.name, places, values, table.spaces))
         return frames
 
     def _frame(self, name: str, places: np.ndarray, values: Mapping[str, Array], spaces: dict[str, Space]) -> Frame:
@@ -128,9 +132,11 @@ class Recorded:
         if (earlier < 0).all():
             return {}
         names = ("log_probabilities",) if self.run.labels else ("mean", "cov")
+        # Of a cloud the moments are kept at the end of each step alone: the others follow from it.
+        tables = list((self.whole if self.run.properties.get("particles") else self.run).stages.values())
         found = {name: np.full((len(places), *self.run.ends[name].shape[1:]), np.nan) for name in names}
         kinds = np.where(earlier >= 0, self._table[earlier], -1)
-        for i, table in enumerate(self._tables):
+        for i, table in enumerate(tables):
             rows = np.flatnonzero(kinds == i)
             for name, values in found.items():
                 values[rows] = table.values[name][self._row[earlier[rows]]]
@@ -143,7 +149,7 @@ class Recorded:
     @cached_property
     def whole(self) -> Run:
         """The recording with its sigma points and clouds."""
-        return load(self.run.path)
+        return _whole_steps(load(self.run.path))
 
     def _geometry_of(self, stage: str) -> set[str]:
         """The names of a stage's sigma points, matches and clouds; a cloud's moments are those that follow from it."""
@@ -153,7 +159,7 @@ class Recorded:
                 found.add(f"{name}.points")
             elif "matches" in what:
                 found |= {f"{name}.{part}" for part in ("source", "target", "distance", "source_index", "target_index")}
-            elif what.get("cloud"):
+            elif what.get("cloud") or is_geometry(name):
                 found.add(name)
         return found
 
@@ -162,20 +168,51 @@ class Recorded:
         return {k: v[rows] for k, v in values.items() if v.dtype == object or not _empty(v[rows])}
 
 
-class _Rows(Mapping[str, Array]):
-    """Some rows of a table's numbers, taken when they are asked for."""
+def _whole_steps(run: Run) -> Run:
+    """The run without the steps of which a kill has left but some stages. BadInput where no step is whole."""
+    count = sound_steps(run) if run.stages or run.complete else 0
+    if not count:
+        raise BadInput(f"{run.path}: it was cut off before its first step was whole")
+    return run if count == len(run.step) else between(run, int(run.step[0]), int(run.step[count - 1]))
 
-    def __init__(self, table: StageTable, rows: np.ndarray) -> None:
-        self._values, self._rows = table.values, rows
+
+def between(run: Run, first: int, last: int) -> Run:
+    """The run's steps from one up to another."""
+    rows = (run.step >= first) & (run.step <= last)
+
+    def cut(table: StageTable) -> StageTable:
+        inside = (table.step >= first) & (table.step <= last)
+        values = {name: value[inside] for name, value in table.values.items()}
+        return replace(table, step=table.step[inside], place=table.place[inside], values=values)
+
+    tables = {name: cut(table) for name, table in run.stages.items()}
+    return replace(
+        run, step=run.step[rows], time=run.time[rows], dt=run.dt[rows], truth=run.truth[rows],
+        inputs={name: value[rows] for name, value in run.inputs.items()},
+        stages={name: table for name, table in tables.items() if len(table.step)},
+        ends={name: value[rows] for name, value in run.ends.items()},
+        error=run.error if last >= run.step[-1] else None,
+    )  # fmt: skip
+
+
+class _Rows(Mapping[str, Array]):
+    """Some rows of a table's numbers, taken when they are asked for; sigma points and clouds from the whole run."""
+
+    def __init__(self, table: StageTable, rows: np.ndarray, geometry: set[str], whole: Callable[[], Run]) -> None:
+        self._table, self._rows, self._geometry, self._whole = table, rows, geometry, whole
 
     def __getitem__(self, name: str) -> Array:
-        return self._values[name][self._rows]
+        table = self._whole().stages[self._table.name] if name in self._geometry else self._table
+        return table.values[name][self._rows]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._table.values or name in self._geometry
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
+        return iter(dict.fromkeys([*self._table.values, *sorted(self._geometry)]))
 
     def __len__(self) -> int:
-        return len(self._values)
+        return len(self._table.values.keys() | self._geometry)
 
 
 class _Row(Mapping[str, Array]):

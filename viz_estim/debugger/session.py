@@ -11,18 +11,20 @@ from typing import IO
 import numpy as np
 
 from viz_estim.debugger import branches, forking
-from viz_estim.debugger.branches import Branch, Screen
+from viz_estim.debugger.branches import Branch
 from viz_estim.debugger.console import COMMANDS, Refused, count
 from viz_estim.debugger.differences import side_by_side
 from viz_estim.debugger.frame_text import health_text, names_text, place_text, quantity_text, why_text
 from viz_estim.debugger.functions import FUNCTIONS
+from viz_estim.debugger.live import Live
 from viz_estim.debugger.moving import Moving
 from viz_estim.debugger.recorded import Recorded
-from viz_estim.debugger.sources import Live, NoSuchPlace
+from viz_estim.debugger.screen import Screen
+from viz_estim.debugger.sources import NoSuchPlace
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, whole
 from viz_estim.parameters import kind_text, parameters
-from viz_estim.recording.recorder import Recorder
+from viz_estim.recording.recorder import Recorder, partial_of
 from viz_estim.running import plan, recorded
 
 
@@ -100,6 +102,8 @@ class Session(Moving):
         step, index = self.step, int(self.frame.index[0])
         parts = forking.changed(parts, step, settings, again)
         source = again.fork(step, parts[-1].scenario)
+        if again.findings:
+            source.findings = again.findings.until(step, parts[-1].scenario, parts[-1].plan.all_params())
         number = len(self.branches) + 1
         about = f"{' '.join(settings)} from step {step} on"
         self.branch = branches.of_parts(number, about, parts, source, self.screen, self.branch.number)
@@ -156,8 +160,11 @@ class Session(Moving):
         """save FILE|this branch so far as a recording"""
         if not text:
             raise Refused("save where? Give a file that ends in .rrd")
-        path = Path(text)
+        path = Path(text[1:-1] if text[0] in "'\"" and text[-1] == text[0] else text)
         check_writable(path, suffix=".rrd")
+        for branch in self.branches:
+            if branch.file and path.resolve() in (branch.file.path.resolve(), partial_of(branch.file.path).resolve()):
+                raise Refused(f"{path} is where branch {branch.number} is being recorded; choose another name")
         source = self.branch.source
         if isinstance(source, Recorded):
             with whole(path) as aside:

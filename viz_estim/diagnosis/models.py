@@ -22,7 +22,8 @@ _FEWEST = 10
 def measured(case: Case) -> Iterator[Finding]:
     """H against how the expected reading changes with the state; H = Cᵀ·P⁻¹, as the update used it."""
     for table in case.run.stages.values():
-        if "innovation.cross_cov" not in table.values or any(key.endswith(".points") for key in table.values):
+        known = {"innovation.cross_cov", "gain"} <= table.values.keys()  # a person's own record may lack them
+        if not known or any(key.endswith(".points") for key in table.values):
             continue  # sigma points have no Jacobian that could be wrong
         space = table.spaces["innovation"]
         assert isinstance(space, Product)

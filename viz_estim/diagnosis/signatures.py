@@ -105,7 +105,7 @@ def faults(case: Case) -> list[Fault]:
     for name, table in case.run.stages.items():
         if (F := transitions(case, table)) is not None:
             moves[name] = F
-        elif "innovation.cross_cov" in table.values:
+        elif {"innovation.cross_cov", "gain"} <= table.values.keys():
             updates[name] = _Update(case, table)
         elif name != "start" and "mean" in table.values and name.startswith("predict"):
             return []

@@ -45,12 +45,15 @@ class Clouds:
         if not any(len(stage.belief.log_weights) > KEPT for stage in step.stages):
             return step
         for stage in step.stages:
-            if isinstance(stage, Resample) and self._before is not None and step.index % self._every == 0:
+            drawn_then = self._layout.position and step.index % self._every == 0
+            if isinstance(stage, Resample) and self._before is not None and drawn_then:
                 self._descent[step.index] = _descent_of(stage, self._before.states)
         self._before = step.stages[-1].belief
         return dataclasses.replace(step, stages=_thinned(step.stages))
 
     def add(self, batch: Batch) -> None:
+        if not self._layout.position:  # of something that is nowhere: its numbers and plots are kept alone
+            return
         for rows in batch.stages:
             self._draw(rows)
             if "ancestors" in self._layout.stages[rows.name]:

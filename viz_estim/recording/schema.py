@@ -72,8 +72,9 @@ def shades(colour: Colour, count: int) -> list[Colour]:
 
 
 def by_weight(share: np.ndarray) -> np.ndarray:
-    """Colours (*,) as 0xRRGGBBAA for weights (*,) between 0 and 1: dark blue for next to nothing, amber for all."""
-    return _RAMP[(255 * np.sqrt(np.clip(share, 0, 1))).astype(np.intp)]
+    """Colours (*,) as 0xRRGGBBAA for weights (*,) between 0 and 1: dark blue for next to nothing (or for a weight that
+    is no number), amber for all."""
+    return _RAMP[(255 * np.sqrt(np.nan_to_num(np.clip(share, 0, 1)))).astype(np.intp)]
 
 
 def by_distance(share: np.ndarray) -> np.ndarray:

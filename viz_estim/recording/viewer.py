@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -101,13 +101,13 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
             if linked := links.moving(blueprint, state.catalog_url or "", recording.store_id):
                 self._ask(self._client.set_blueprint, linked, store_id=recording.store_id)
 
-    def seek(self, timeline: str, value: float | None = None) -> None:
+    def seek(self, timeline: str, value: float | None = None, seconds: float = SEEK_S) -> None:
         """Moves the front recording's cursor, and waits until it is there; a moment still on its way is waited for.
 
         `step` and `stage` are counted from 0, `time` is in seconds; None is the timeline's end.
         """
         sent, problem = None, "no recording is open; open one first"
-        for _ in _polls(SEEK_S):
+        for _ in _polls(seconds):
             state = self._state()
             for front in [recording for recording in state.recordings if recording.store_id == state.active_recording]:
                 problem = f"no timeline {timeline!r}; choose from: {', '.join(line.name for line in front.timelines)}"
@@ -124,6 +124,29 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
                         self._ask(self._client.set_time, timeline, sequence=goal[1], play_state="paused")
                         sent, problem = goal, "the cursor did not stay where it was put; try again"
         raise ViewerError(problem)
+
+    def front(self, but: Collection[str] = (), seconds: float = LOAD_S) -> str:
+        """The location of the recording in front, for `show`; waits until it has data and is none of `but`."""
+        for _ in _polls(seconds):
+            with contextlib.suppress(ViewerError):  # nothing is open yet
+                state = self._state()
+                there = any(one.store_id == state.active_recording and one.timelines for one in state.recordings)
+                location: str = self._ask(self._client.get_location) if there else ""
+                if location and location not in but:
+                    return location
+            if not self.alive:
+                raise self._ended()
+        raise ViewerError("the viewer does not show the recording")
+
+    def show(self, location: str) -> None:
+        """Brings a recording to the front."""
+        self._ask(self._client.set_location, location)
+
+    def cursor(self) -> tuple[str | None, int | None]:
+        """The timeline of the recording in front, and where on it the cursor stands: a count, or nanoseconds."""
+        state = self._state()
+        fronts = [one for one in state.recordings if one.store_id == state.active_recording]
+        return (fronts[0].current_timeline, fronts[0].current_time) if fronts else (None, None)
 
     def problems(self) -> list[str]:
         """What views could not draw, and what the viewer warned of since the newest `open`: a line each."""
