@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,17 +11,21 @@ import numpy as np
 from viz_estim.diagnosis import (
     confidence,
     covariance,
+    errors,
     geometry,
     icp,
     innovations,
+    kinematics,
     models,
+    motion,
     particles,
     sensors,
     signatures,
     stamps,
+    truth,
 )  # fmt: skip
 from viz_estim.diagnosis.evidence import Case, case
-from viz_estim.diagnosis.finding import CODES, Finding
+from viz_estim.diagnosis.finding import CODES, SYMPTOMS, Finding, Severity
 from viz_estim.recording import schema
 from viz_estim.recording.marks import Mark
 from viz_estim.recording.reader import Run
@@ -33,8 +38,6 @@ OF_SENSORS: tuple[Callable[[Run], Iterator[Finding]], ...] = (
     stamps.stamps,
 )
 OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
-    confidence.by_sensor,
-    confidence.by_part,
     innovations.biased,
     innovations.coloured,
     innovations.outliers,
@@ -43,7 +46,11 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     innovations.lost,
     signatures.lags,
     signatures.biases,
+    truth.start,
+    truth.sensors,
+    motion.prediction,
     covariance.broken,
+    covariance.claims,
     covariance.bounds,
     covariance.unobservable,
     models.measured,
@@ -53,40 +60,37 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     geometry.units_or_axes,
     particles.collapsed,
     particles.clamped,
+    particles.far,
     particles.several_modes,
     icp.not_converged,
     icp.few_matches,
     icp.rising,
 )
-# What only says how well a model fits: while a sensor is at fault, that fault comes first.
-_OF_MODELS = {
-    "overconfident",
-    "underconfident",
-    "biased_innovation",
-    "coloured_innovation",
-    "outliers",
-    "diverged",
-    "lag",
-}
-_OF_MODELS |= {"gate", "units_or_axes"}
+
+
+_TIMES = 3  # the tier of what is off in time: of what is no matter of a noise
 
 
 def diagnose(run: Run) -> list[Finding]:
     """The findings of a run, errors first, then by their first step.
 
-    Steps at which a sensor is found frozen are left out of what is said of the filter; while a sensor is at fault,
-    what only tells of the models is a warning at most.
+    Steps at which a sensor is found frozen are left out of what is said of the filter.
     """
     with np.errstate(all="ignore"):
         found = [finding for check in OF_SENSORS for finding in check(run)]
+        found = _without_a_wrong_gyro_s(run, found)
         faulty = [f.steps for f in found if f.code == "sensor_frozen"]
         found += sensors.saturated(run, faulty)
-        at_fault = any(f.code == "sensor_frozen" and f.severity == "error" for f in found)
         found += _failure(run)
         under_test = case(run, faulty)
         for check in OF_FILTERS:
-            found += [_softened(finding) if at_fault else finding for finding in check(under_test)]
-    return sorted(_once(found), key=lambda finding: finding.order)
+            found += check(under_test)
+        found = _ranked(found)
+        # Noises are tuned once nothing else is wrong: until then a factor on them would only hide it.
+        tuned = replace(under_test, tune=not any(f.severity == "error" and f.tier <= _TIMES for f in found))
+        for check in (confidence.by_sensor, errors.by_part):
+            found += check(tuned)
+    return sorted(_once(_ranked(found)), key=lambda finding: finding.order)
 
 
 def to_json(findings: list[Finding]) -> dict[str, Any]:
@@ -148,6 +152,14 @@ def codes_text() -> str:
     return "\n".join(f"{code:{width}}  {meaning}" for code, meaning in CODES.items())
 
 
+def _without_a_wrong_gyro_s(run: Run, found: list[Finding]) -> list[Finding]:
+    """Without an accelerometer's freeze that a gyro of wrong units or axes made look like one."""
+    stuck = [f for f in found if (f.code, f.sensor) == ("sensor_frozen", "accel")]
+    if stuck and any(f.sensor == "gyro" for f in kinematics.imu_axes(case(run))):
+        return [f for f in found if f not in stuck]
+    return found
+
+
 def _failure(run: Run) -> list[Finding]:
     if run.error is None:
         return []
@@ -165,10 +177,51 @@ def _failure(run: Run) -> list[Finding]:
     ]
 
 
-def _softened(finding: Finding) -> Finding:
-    if finding.code in _OF_MODELS and finding.severity == "error":
-        return Finding(**(vars(finding) | {"severity": "warning"}))
-    return finding
+def _softened(finding: Finding, cause: Finding | None) -> Finding:
+    """A warning at most, with what to mend before it, if it follows from another."""
+    if cause is None:
+        return finding
+    name = cause.code + (f" of {cause.sensor}" if cause.sensor else "")
+    remedy = (
+        finding.remedy if finding.remedy.startswith("mend ") else f"mend {name} first; if this stays: {finding.remedy}"
+    )
+    severity: Severity = "warning" if finding.severity == "error" else finding.severity
+    return replace(finding, severity=severity, remedy=remedy)
+
+
+def _ranked(found: list[Finding]) -> list[Finding]:
+    """What follows from another finding is a warning at most, so that the cause comes first.
+
+    Symptoms follow from any cause; a cause follows from one of an earlier tier of the same sensor, or of none. What the
+    truth says of a sensor's bias or lag stands in place of what innovations make of it, but not where its Jacobian, by
+    which the truth is brought to it, is wrong.
+    """
+    wrong = {f.sensor for f in found if f.code == "jacobian"}
+    found = [f for f in found if not (f.evidence.get("against") == "truth" and f.sensor in wrong and f.sensor)]
+    seen = {(f.code, f.sensor) for f in found if f.evidence.get("against") == "truth"}
+    found = [f for f in found if f.evidence.get("against") == "truth" or (f.code, f.sensor) not in seen]
+    if not any(f.severity != "note" and (f.code in SYMPTOMS or f.code == "biased_innovation") for f in found):
+        found = [f for f in found if f.code != "process_model"]  # a filter that knows how wrong it is
+    if any(f.severity == "error" and f.code == "biased_innovation" and "bias" in f.evidence for f in found):
+        # Which sensor's bias explains the innovations is known: those of others lie off for it.
+        best = next(
+            f for f in found if f.code == "biased_innovation" and f.severity == "error" and "bias" in f.evidence
+        )
+        others = [f.code == "biased_innovation" and "bias" not in f.evidence for f in found]
+        found = [_softened(f, best) if other else f for f, other in zip(found, others, strict=True)]
+    errors = [f for f in found if f.severity == "error" and f.code != "sensor_silent"]
+    return [_softened(f, next((c for c in errors if _follows(f, c)), None)) for f in found]
+
+
+def _follows(finding: Finding, cause: Finding) -> bool:
+    if finding.code in SYMPTOMS and cause.code in SYMPTOMS:
+        # Errors of the state, from innovations of another size; and that these follow one another.
+        size = cause.code in ("overconfident", "outliers") and "part" not in cause.evidence
+        return size and ("part" in finding.evidence or finding.code == "coloured_innovation")
+    if finding.tier <= cause.tier:
+        return False
+    anywhere = finding.code in SYMPTOMS or cause.code == "sensor_frozen"
+    return anywhere or finding.sensor == cause.sensor or None in (finding.sensor, cause.sensor)
 
 
 def _once(found: list[Finding]) -> Iterator[Finding]:

@@ -91,7 +91,7 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         if told or not isinstance(space, Euclidean) or not 1 <= len(space.axes) <= 3 or len(readings) < 10:
             continue
         own = float(np.nansum(readings.nis))
-        candidates = list(maps(len(space.axes)))
+        candidates = list(maps(len(space.axes), space.axis_units[0]))
         best, what = np.inf, ""
         for title, M in candidates:
             value = float(np.nansum(squared_distance(readings.z @ M.T - readings.predicted, readings.cov)))

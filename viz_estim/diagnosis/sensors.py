@@ -12,12 +12,12 @@ from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.finding import Finding, judge, level
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.reader import Run
-from viz_estim.scenarios.imu_health import GRAVITY, frozen_gyro, still_prefix
+from viz_estim.scenarios.imu_health import GRAVITY, frozen_accel, frozen_gyro, still_prefix
 
 _SLOWER = 3.0  # a pause of so many usual intervals is one in which readings are missing
 _AT_THE_END = 0.75  # of a smooth signal's extreme and next value: an arc sine has 0.71 at its extreme
 _RESTING = 0.05  # rad/s: more than that is no bias that was left over
-_HELD = 0.05  # the share of readings that repeat the one before, where they are held
+_HELD = "a reading is held and given again until the next one comes"
 
 
 class Given(NamedTuple):
@@ -84,9 +84,12 @@ def frozen(run: Run) -> Iterator[Finding]:
         flags = frozen_gyro(run.time[both.rows], both.rate, both.force, np.zeros(3))
         for first, last in _runs(flags):
             yield _stuck(run, "gyro", both.rows[first], both.rows[last], {"level": both.rate[first : last + 1].mean(0)})
+        for first, last in _runs(frozen_accel(run.time[both.rows], both.rate, both.force) & ~flags):
+            level_of = both.force[first : last + 1].mean(0)
+            yield _stuck(run, "accel", both.rows[first], both.rows[last], {"level": level_of})
     sensors = given(run)
     for name, (rows, values) in sensors.items():
-        if not _continuous(values):
+        if not _continuous(values) or (both is not None and name in ("gyro", "accel")):
             continue
         same = (np.diff(values, axis=0) == 0).all(1)
         for first, last in _runs(same):
@@ -199,7 +202,11 @@ def _left_of(run: Run, one: Given, without: Sequence[tuple[int, int]]) -> Given:
 
 
 def used_twice(run: Run) -> Iterator[Finding]:
-    """One reading taken in twice: by two updates of a step, or held and given again at the next tick."""
+    """One reading taken in twice: by two updates of a step, or held and given again at the next tick.
+
+    Equal neighbours may be chance where readings are counts. Then a reading is equal to the one before it as often as
+    to the one before that alone: of A and B such pairs A is binomial with 1/(2 − q), q the share of the first.
+    """
     seen: dict[tuple[str, int], list[Array]] = {}
     twice: dict[str, set[int]] = {}
     for table in run.stages.values():
@@ -215,17 +222,22 @@ def used_twice(run: Run) -> Iterator[Finding]:
                     known.append(z[row])
     for name, steps in twice.items():
         yield _twice(name, (min(steps), max(steps)), len(steps), "at one step two updates take in the same reading")
-    for name, (rows, values) in given(run).items():
+    sensors_given = given(run)
+    for name, (rows, values) in sensors_given.items():
         if name in twice or not _continuous(values):
             continue
         same = (np.diff(values, axis=0) == 0).all(1)
         short = np.zeros(len(same), bool)
         for first, last in _runs(same):
             short[first : last + 1] = (last - first) < len(same) / 10
-        if short.mean() > _HELD:
+        again = int(((values[2:] == values[:-2]).all(1) & ~same[1:]).sum())
+        held, q = int(short.sum()), float(short.mean())
+        if judge(float(binom.sf(held - 1, held + again, 1 / (2 - q))), len(sensors_given), large=True) == "error":
             at = np.flatnonzero(short) + 1
             steps_held = int(run.step[rows[at[0]]]), int(run.step[rows[at[-1]]])
-            yield _twice(name, steps_held, len(at), "a reading is held and given again until the next one comes")
+            doubled = float((np.diff(run.time)[np.maximum(rows[at] - 1, 0)] == 0).mean()) > 0.5
+            how = "samples are in the log twice, with one stamp" if doubled else _HELD
+            yield _twice(name, steps_held, len(at), how)
 
 
 def _twice(name: str, steps: tuple[int, int], count: int, how: str) -> Finding:
