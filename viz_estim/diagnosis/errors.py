@@ -64,8 +64,7 @@ def _too_sure(case: Case, name: str) -> tuple[str, str]:
     """Why a part's error may be larger than its covariance, and what to try, by the kind of estimator."""
     if any("rmse" in table.values for table in case.run.stages.values()):
         return (
-            "it takes every pair of points as right and its error as its own, while neighbours share wrong pairs (Censi "
-            "2007)",
+            "it takes each pair of points as right and its error as its own, while neighbours share them (Censi 2007)",
             "do not weigh by this covariance; take the spread of registrations from several starts, or a fixed one",
         )
     if case.run.properties.get("belief") == "Particles":

@@ -8,7 +8,7 @@ import numpy as np
 
 from viz_estim.core.consistency import squared_distance
 from viz_estim.core.spaces import SO3, Euclidean
-from viz_estim.diagnosis.axes import EXPLAINED, finding_of, maps
+from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import Finding, level
 from viz_estim.diagnosis.kinematics import imu_axes
@@ -98,5 +98,5 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
             if value < best:
                 best, what = value, title
         gain, explained = 0.5 * (own - best), 1 - best / max(own, 1e-300)
-        if gain > -np.log(level("error", 60 * len(case.sensors))) and explained > EXPLAINED:
+        if gain > -np.log(level("error", 60 * len(case.sensors))) and explains(what, explained):
             yield finding_of(name, readings.steps, what, explained, gain)

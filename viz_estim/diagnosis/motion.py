@@ -111,7 +111,9 @@ def _moves_as(
     if by_factor:
         if (ends[0] - 1) * (ends[1] - 1) <= 0:
             return
-        factor = min(ends, key=lambda f: abs(f - 1))  # of what is predicted, against what happens
+        # Of what is predicted, against what happens: the end that has a name, or the more careful one.
+        known = [f for f in ends if named(f, unit) != named(1.3, unit)]
+        factor = known[0] if known else min(ends, key=lambda f: abs(f - 1))
         p = max(p_factor, p_back)
         severity = judge(p, tests, large=abs(factor - 1) > 0.05)
         sign = (
@@ -129,8 +131,8 @@ def _moves_as(
     else:
         severity = judge(p_drift, tests, large=abs(drift) > 0.05 * float(np.abs(told).mean()))
         cause = (
-            f"the prediction misses a steady {drift:+.3g} {unit}/s of {label}: the control that moves it has a bias, or "
-            "a force is missing from the model"
+            f"the prediction misses a steady {drift:+.3g} {unit}/s of {label}: the control that moves it has a bias, "
+            "or a force is missing from the model"
         )
         remedy = f"calibrate that bias ({drift:+.3g} {unit}/s), or add it to the state and let the filter estimate it"
         evidence = {"component": label, "drift": drift, "p": p_drift}
@@ -148,6 +150,6 @@ def _slope(y: Array, x: Array) -> tuple[float, float, float]:
     pieces = np.array([part.sum() for part in np.array_split(x * left, min(STRETCHES, len(y) // 5))])
     B = len(pieces)
     scatter, model = float(pieces @ pieces) * B / (B - 1) / A**2, float(left @ left) / len(y) / A
-    if scatter < model * chi2.isf(0.05, B - 1) / (B - 1):
+    if scatter < model * chi2.isf(0.01, B - 1) / (B - 1):
         return slope, float(2 * t.sf(abs(slope) / np.sqrt(max(model, 1e-300)), len(y) - 1)), float(left @ left)
     return slope, float(2 * t.sf(abs(slope) / np.sqrt(scatter), B - 1)), float(left @ left)

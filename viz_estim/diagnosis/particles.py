@@ -171,5 +171,5 @@ def far(case: Case) -> Iterator[Finding]:
                 {"steps": int(bad.sum()), "least_p": float(p.min())},
                 f"at {int(bad.sum())} steps no particle is where the readings are: even the best one explains "
                 "them worse than their noise allows",
-                "take more particles or a wider motion noise; if it stays, check the units and the order of the readings",
+                "take more particles or a wider motion noise; then check the units and the order of the readings",
             )  # fmt: skip

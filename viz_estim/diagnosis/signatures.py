@@ -160,7 +160,7 @@ def _estimated(name: str, kind: str, A: Array, b: Array, misfit: float) -> Fault
     rest = (b - size * A)[A > 0]
     variance = float(np.square(rest).sum() * used / max(used - 1, 1))
     p = 2 * norm.sf(abs(score))
-    if variance > A.sum() * misfit * chi2.isf(0.05, max(used - 1, 1)) / max(used - 1, 1):
+    if variance > A.sum() * misfit * chi2.isf(0.01, max(used - 1, 1)) / max(used - 1, 1):
         p = max(p, 2 * t.sf(abs(b.sum()) / np.sqrt(variance), max(used - 1, 1)))
     return Fault(name, kind, float(size), score, float(p))
 

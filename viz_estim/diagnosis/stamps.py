@@ -40,7 +40,7 @@ def stamps(run: Run) -> Iterator[Finding]:
         wrong = np.abs(run.dt[other] - interval[other - 1])
         yield _finding(
             run, other, "error" if wrong.sum() > _LARGE * np.abs(interval).sum() else "warning", "dt",
-            f"the filter's dt is not the difference of the stamps (by up to {wrong.max():.3g} s): it may take a fixed one",
+            f"the filter's dt is not the difference of the stamps (by up to {wrong.max():.3g} s), as if it were fixed",
             "use each step's own dt = time[k] − time[k−1]",
         )  # fmt: skip
     if len(same):
@@ -89,8 +89,8 @@ def _jitter(run: Run, interval: Array, usual: float, rounding: float) -> Iterato
         yield Finding(
             "stamps", "note", None, (int(run.step[0]), int(run.step[-1])),
             {"kind": "jitter", "std_s": spread, "usual_interval_s": usual, "autocorrelation": rho},
-            f"stamps jitter by {spread:.2g} s about {usual:.3g} s, each long interval followed by a short one: they were "
-            "taken when samples arrived, not when they were measured",
+            f"stamps jitter by {spread:.2g} s about {usual:.3g} s, a long interval before a short one: they were taken "
+            "when samples arrived, not when they were measured",
             "use the sensor's own clock, or smooth the stamps by a line through them, if the readings are fast",
         )  # fmt: skip
 

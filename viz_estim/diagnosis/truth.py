@@ -2,8 +2,8 @@
 
 With e the error before an update, a reading is off the truth's own by r = ν − H·e, which is N(0, R) and white if the
 sensor is what the filter takes it for; the prediction from the truth is off by w = e' − F·e, which is N(0, Q). This is
-right to first order in e. How far it is off by is told from how H and F change along the run (their Lipschitz constant):
-what is not larger than that is no finding.
+right to first order in e. By how much it is off is told from how H and F change along the run: what is not larger than
+that is no finding.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.stats import chi2, t
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean, Product, Space
-from viz_estim.diagnosis.axes import EXPLAINED, maps, units
+from viz_estim.diagnosis.axes import explains, maps, units
 from viz_estim.diagnosis.evidence import Case, jacobians, parameter
 from viz_estim.diagnosis.finding import Finding, judge
 
@@ -167,7 +167,7 @@ class _Fitted(NamedTuple):
 
 
 def _fit(one: Against, design: Array) -> _Fitted:
-    """r (M, m) on a design (M, m, k) by least squares in R; explained: the share of Σ|r|² beyond what noise would be."""
+    """r (M, m) on a design (M, m, k) by least squares in R; explained: the share of Σ|r|² beyond what noise is."""
     X, y = _white(one, design), _white(one, one.r)
     M, m, k = X.shape
     A = np.einsum("tmi,tmj->ij", X, X)
@@ -184,7 +184,7 @@ def _fit(one: Against, design: Array) -> _Fitted:
     error = np.sqrt(np.maximum(np.diag(robust), np.diag(model)))
     p = 2 * t.sf(np.abs(beta) / np.maximum(error, 1e-300), B - 1)
     # Where the scatter over stretches is no larger than the noise's own, this is normal: a t of 19 would waste power.
-    plain = np.diag(robust) < np.diag(model) * chi2.isf(0.05, B - 1) / (B - 1)
+    plain = np.diag(robust) < np.diag(model) * chi2.isf(0.01, B - 1) / (B - 1)
     p = np.where(plain, 2 * t.sf(np.abs(beta) / np.sqrt(np.diag(model)), M - k), p)
     own, rest = float((y**2).sum()), float((left**2).sum())
     # In the least variance that explains the rest, so that an R that is too small does not count for a cause.
@@ -203,9 +203,9 @@ def _bias(one: Against) -> Cause | None:
     return Cause(
         "biased_innovation", fit.gain, m, float(fit.p[worst]), float(size[worst]), fit.explained,
         {"component": axis, "bias": value, "mean_sigma": float(size[worst])},
-        f"against the truth, readings of {label} are {value:+.3g} {unit} off on the average: the sensor has a bias that "
-        "the filter does not know of",
-        f"subtract {value:+.3g} {unit} from {label}, or add a bias of {name} to the state and let the filter estimate it",
+        f"against the truth, readings of {label} are {value:+.3g} {unit} off on the average: the sensor has a bias "
+        "that the filter does not know of",
+        f"subtract {value:+.3g} {unit} from {label}, or add a bias of {name} to the state, to be estimated",
     )  # fmt: skip
 
 
@@ -218,8 +218,11 @@ def _lag(case: Case, one: Against) -> Cause | None:
     middle = Against(*(v[1:-1] if isinstance(v, np.ndarray) else v for v in one))  # type: ignore[arg-type]
     m = rate.shape[1]
     design = np.concatenate([-rate[..., None], np.broadcast_to(np.eye(m), (len(rate), m, m))], axis=-1)
-    both, constant = _fit(middle, design), _fit(middle, design[..., 1:])
-    tau = float(both.coefficients[0])
+    both, alone = _fit(middle, design), _fit(middle, design[..., :1])
+    # A constant beside it costs power where the way is straight; it is fitted only where there is one.
+    p, tau = float(alone.p[0]), float(alone.coefficients[0])
+    if both.p[1:].min() < 0.05:
+        p, tau = float(both.p[0]), float(both.coefficients[0])
     interval = float(np.median(np.diff(case.run.time)))
     shift = float(np.sqrt(np.mean(_white(middle, tau * rate) ** 2)))
     if abs(tau) < 0.5 * interval:
@@ -228,12 +231,11 @@ def _lag(case: Case, one: Against) -> Cause | None:
     readings = float(np.median(np.diff(one.time)))
     if abs(tau) > 0.1 * (one.time[-1] - one.time[0]):
         return None  # so long a lag is no matter of a rate
-    alone = _fit(middle, design[..., :1])
     return Cause(
-        "lag", alone.gain, 1, float(both.p[0]), max(shift, _LARGE * 1.01), both.explained - 0.5 * constant.explained,
-        {"lag_s": tau, "lag_samples": tau / max(readings, 1e-12)},
-        f"against the truth, readings of {one.name} come {abs(tau):.3g} s {late} ({abs(tau) / max(readings, 1e-12):.1f} "
-        "of its samples): a delay of the sensor or of the truth, another clock, or an index that is one off",
+        "lag", alone.gain, 1, p, max(shift, _LARGE * 1.01), alone.explained,
+        {"lag_s": tau, "lag_samples": tau / readings},
+        f"against the truth, readings of {one.name} come {abs(tau):.3g} s {late} ({abs(tau) / readings:.1f} of its "
+        "samples): a delay of the sensor or of the truth, another clock, or an index that is one off",
         f"pair {one.name} by its stamps and not by index; correct its stamps by {-tau:+.3g} s",
     )  # fmt: skip
 
@@ -250,7 +252,7 @@ def _maps(one: Against) -> Iterator[Cause]:
         if left < best:
             best, what = left, title
     gain, explained = 0.5 * M * m * np.log(own / max(best, 1e-300)), 1 - best / max(own, 1e-300)
-    if explained > EXPLAINED and np.sqrt(own / best) > 1.5:
+    if explains(what, explained) and np.sqrt(own / best) > 1.5:
         words = f"the readings as {what}" if what.startswith("axes") else f"a factor ({what})"
         yield Cause(
             "units_or_axes", gain, 1, float(np.exp(-min(gain, 700.0))) * 60, float(np.sqrt(own / (M * m))), explained,

@@ -1,10 +1,10 @@
 """Which factor on R or on Q would make the filter consistent: the same filter again, with other noises.
 
 A linear filter's innovations under other noises follow from the recorded ones: with d the difference of the two
-estimates, d' = F·d and ν_f = ν − H·d before an update, d⁺ = d + K_f·ν_f − K·ν after it, and P_f by the Riccati recursion
-from the recorded F, H, R and Q = P' − F·P·Fᵀ. The factor is the one of the greatest likelihood of the innovations,
-−½·Σ(ν_fᵀ·S_f⁻¹·ν_f + log|S_f|) (Mehra 1970; Abbeel et al. 2005). For a linearised filter this is right as long as d is
-small. Nothing of the filter is run.
+estimates, d' = F·d and ν_f = ν − H·d before an update, d⁺ = d + K_f·ν_f − K·ν after it, and P_f by the Riccati
+recursion from the recorded F, H, R and Q = P' − F·P·Fᵀ. The factor is that of the greatest likelihood of the
+innovations, −½·Σ(ν_fᵀ·S_f⁻¹·ν_f + log|S_f|) (Mehra 1970; Abbeel et al. 2005). For a linearised filter this is right
+as long as d is small. Nothing of the filter is run.
 """
 
 from __future__ import annotations

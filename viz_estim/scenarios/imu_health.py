@@ -84,8 +84,8 @@ def flat_runs(stamps: Array, values: Array) -> list[tuple[int, int]]:
 def frozen_accel(stamps: Array, gyro: Array, accel: Array) -> np.ndarray:
     """Which samples (T,) were taken while the accelerometer was stuck: flat in all channels while the gyro turns it.
 
-    gyro (T, 3) rad/s; accel (T, 3). What tells a stuck one from one at rest: the gyro's rates, but for their mean, carry
-    gravity by more than their noise adds up to.
+    gyro (T, 3) rad/s; accel (T, 3). What tells a stuck one from one at rest: the gyro's rates, but for their mean,
+    carry gravity by more than their noise adds up to.
     """
     frozen = np.zeros(len(stamps), bool)
     for first, end in flat_runs(stamps, accel):
