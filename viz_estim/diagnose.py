@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from viz_estim.diagnosis import (
     confidence,
@@ -85,9 +86,9 @@ def diagnose(run: Run) -> list[Finding]:
         under_test = case(run, faulty)
         for check in OF_FILTERS:
             found += check(under_test)
-        found = _ranked(found)
         # Noises are tuned once nothing else is wrong: until then a factor on them would only hide it.
-        tuned = replace(under_test, tune=not any(f.severity == "error" and f.tier <= _TIMES for f in found))
+        causes = [f for f in _ranked(found) if f.severity == "error" and f.tier <= _TIMES and f.code != "start"]
+        tuned = replace(under_test, tune=not causes)
         for check in (confidence.by_sensor, errors.by_part):
             found += check(tuned)
     return sorted(_once(_ranked(found)), key=lambda finding: finding.order)
@@ -209,8 +210,19 @@ def _ranked(found: list[Finding]) -> list[Finding]:
         )
         others = [f.code == "biased_innovation" and "bias" not in f.evidence for f in found]
         found = [_softened(f, best) if other else f for f, other in zip(found, others, strict=True)]
+    found = [_of_the_noise(f, found) if f.code == "start" else f for f in found]
     errors = [f for f in found if f.severity == "error" and f.code != "sensor_silent"]
     return [_softened(f, next((c for c in errors if _follows(f, c)), None)) for f in found]
+
+
+def _of_the_noise(start: Finding, found: list[Finding]) -> Finding:
+    """A start that was made of readings is as far off as their R is too small: then that is the cause."""
+    for f in found:
+        factor, white = f.evidence.get("factor_on_R"), abs(f.evidence.get("autocorrelation", 1.0)) < 0.2
+        if f.code == "overconfident" and factor and white:
+            if chi2.sf(start.evidence["nees"] / factor, start.evidence["dof"]) > 0.01:
+                return _softened(start, f)
+    return start
 
 
 def _follows(finding: Finding, cause: Finding) -> bool:

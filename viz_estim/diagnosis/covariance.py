@@ -157,7 +157,7 @@ def bounds(case: Case) -> Iterator[Finding]:
         sigma = np.sqrt(np.maximum(np.diagonal(run.cov, axis1=1, axis2=2)[:, axes], 0)).max(1)
         falls = sigma[ends[1:]] / np.maximum(sigma[ends[:-1]], 1e-300)
         deaf = sigma[rows] < np.finfo(float).eps * np.abs(run.mean[rows][:, at]).max()
-        if sigma[rows[0]] > 0 and ((falls < 0.999 * fastest).all() or deaf[-1]):
+        if sigma[rows[0]] > 0 and ((falls < 0.999 * fastest).all() or (deaf[-1] and not deaf[0])):
             step = int(run.step[rows[int(np.argmax(deaf))]] if deaf.any() else run.step[ends[0]])
             yield Finding(
                 "covariance", "error", None, (step, int(run.step[rows[-1]])), {"kind": "collapsed", "part": name},

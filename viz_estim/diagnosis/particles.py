@@ -153,7 +153,7 @@ def far(case: Case) -> Iterator[Finding]:
     run = case.run
     inputs = [name for name in run.inputs if name.startswith("z.")]
     for table in run.stages.values():
-        if "log_likelihoods" not in table.values or not inputs:
+        if not {"log_likelihoods", "states"} <= table.values.keys() or not inputs:
             continue
         best = np.nanmax(table.values["log_likelihoods"], axis=1)
         row = np.searchsorted(run.step, table.step)

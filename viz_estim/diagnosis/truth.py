@@ -24,7 +24,7 @@ FEWEST = 30
 STRETCHES = 20
 _TURNED = 0.1  # rad
 SURELY = 0.95  # of the misfit explained: no error of a linearisation looks like that
-_LARGE = 0.5  # of R's standard deviation
+_SMALL, _LARGE = 0.1, 0.5  # of R's standard deviation
 _NEAR = 0.1  # a factor is that of a known unit, or −1, within a tenth
 
 
@@ -75,7 +75,7 @@ def sensors(case: Case) -> Iterator[Finding]:
         causes = [c for c in (*_maps(one), _bias(one), _lag(case, one)) if c is not None]
         found = [(c, judge(c.p, tests, large=c.size > _LARGE)) for c in causes]
         slip = 2 * float(np.median(one.slip))
-        found = [(c, s) for c, s in found if s and (c.size > slip or (c.explained > SURELY and c.known))]
+        found = [(c, s) for c, s in found if s and (c.size > max(slip, _SMALL) or (c.explained > SURELY and c.known))]
         if not found or name in told:
             continue
         best, severity = max(found, key=lambda entry: entry[0].gain - 0.5 * entry[0].k * np.log(len(one.step)))
