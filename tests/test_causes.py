@@ -14,7 +14,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario, Tick, run
 from viz_estim.core.spaces import Euclidean, Product
 from viz_estim.diagnose import diagnose
-from viz_estim.diagnosis import covariance, evidence, sensors, stamps, tuning
+from viz_estim.diagnosis import covariance, evidence, repeats, stamps, tuning
 from viz_estim.diagnosis.finding import Finding
 from viz_estim.recording.memory import collect
 from viz_estim.recording.reader import Run
@@ -213,11 +213,11 @@ def test_counts_at_rest_are_not_taken_for_readings_that_are_held() -> None:
     counts = np.round(rng.normal(500, 0.8, (900, 3))) / 34.3
     fine = counts / np.linalg.norm(counts, axis=1, keepdims=True)  # no longer multiples of one step
     time = 0.01 * np.arange(900)
-    assert list(sensors.used_twice(log(time, z_accel=fine))) == []
-    (twice,) = sensors.used_twice(log(time, z_accel=np.repeat(rng.normal(size=(300, 3)), 3, axis=0)))
+    assert list(repeats.used_twice(log(time, z_accel=fine))) == []
+    (twice,) = repeats.used_twice(log(time, z_accel=np.repeat(rng.normal(size=(300, 3)), 3, axis=0)))
     assert twice.code == "used_twice"
     doubled = np.repeat(rng.normal(size=(450, 3)), 2, axis=0)
-    (same,) = sensors.used_twice(log(np.repeat(0.01 * np.arange(450), 2), z_accel=doubled))
+    (same,) = repeats.used_twice(log(np.repeat(0.01 * np.arange(450), 2), z_accel=doubled))
     assert "samples are in the log twice" in same.cause
 
 

@@ -276,36 +276,3 @@ def named(factor: float, unit: str) -> str:
     if known:
         return known[0]
     return "a sign" if abs(factor + 1) < _NEAR else "a scale factor that is not 1"
-
-
-def start(case: Case) -> Iterator[Finding]:
-    """The error of the first belief against its covariance: eᵀ·P⁻¹·e is χ² of as many components as have a truth."""
-    run = case.run
-    if run.labels or run.properties.get("belief") == "Particles" or not {"mean", "cov"} <= run.ends.keys():
-        return
-    if any("rmse" in table.values for table in run.stages.values()):
-        return  # a registration starts where it is told to, and says so by no covariance
-    table = run.stages.get("start")
-    known_at = np.flatnonzero((run.step >= case.first) & np.isfinite(run.truth).any(1) & np.isfinite(run.mean).all(1))
-    if not len(known_at) or known_at[0] > run.row(step=case.whole[0]) + 0.05 * len(run.step):
-        return
-    k = int(known_at[0])
-    mean, P = run.mean[k], run.cov[k]
-    if table is not None and int(run.step[k]) in table.step.tolist():
-        mean, P = table.mean[-1], table.cov[-1]
-    error = case.space.minus(run.truth[k], mean)
-    known = np.isfinite(error) & (np.diag(P) > 0)
-    if not known.any() or np.linalg.cond(P[known][:, known]) > 1e13:
-        return
-    value, dof = float(error[known] @ np.linalg.solve(P[known][:, known], error[known])), int(known.sum())
-    severity = judge(float(chi2.sf(value, dof)), 1, large=True)
-    if severity:
-        sigma = np.where(known, np.abs(error) / np.sqrt(np.where(known, np.diag(P), 1.0)), 0.0)
-        worst = int(np.argmax(sigma))
-        name, unit, step = case.space.axes[worst], case.space.axis_units[worst], int(run.step[k])
-        yield Finding(
-            "start", severity, None, (step, step),
-            {"component": name, "error": float(error[worst]), "sigma": float(sigma[worst]), "nees": value, "dof": dof},
-            f"the filter starts {sigma[worst]:.2g}σ off the truth, most of all in {name} ({error[worst]:+.3g} {unit})",
-            f"start it nearer, or with a standard deviation of {name} of about {abs(error[worst]):.2g} {unit}",
-        )  # fmt: skip
