@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,17 +11,23 @@ import numpy as np
 from viz_estim.diagnosis import (
     confidence,
     covariance,
+    errors,
     geometry,
     icp,
     innovations,
+    kinematics,
     models,
+    motion,
     particles,
+    repeats,
     sensors,
     signatures,
     stamps,
+    truth,
 )  # fmt: skip
 from viz_estim.diagnosis.evidence import Case, case
 from viz_estim.diagnosis.finding import CODES, Finding
+from viz_estim.diagnosis.ranking import ranked
 from viz_estim.recording import schema
 from viz_estim.recording.links import link
 from viz_estim.recording.marks import Mark
@@ -29,13 +36,11 @@ from viz_estim.recording.reader import Run
 OF_SENSORS: tuple[Callable[[Run], Iterator[Finding]], ...] = (
     sensors.frozen,
     sensors.silent,
-    sensors.used_twice,
+    repeats.used_twice,
     sensors.biased_at_rest,
     stamps.stamps,
 )
 OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
-    confidence.by_sensor,
-    confidence.by_part,
     innovations.biased,
     innovations.coloured,
     innovations.outliers,
@@ -44,7 +49,11 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     innovations.lost,
     signatures.lags,
     signatures.biases,
+    errors.start,
+    truth.sensors,
+    motion.prediction,
     covariance.broken,
+    covariance.claims,
     covariance.bounds,
     covariance.unobservable,
     models.measured,
@@ -54,40 +63,37 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     geometry.units_or_axes,
     particles.collapsed,
     particles.clamped,
+    particles.far,
     particles.several_modes,
     icp.not_converged,
     icp.few_matches,
     icp.rising,
 )
-# What only says how well a model fits: while a sensor is at fault, that fault comes first.
-_OF_MODELS = {
-    "overconfident",
-    "underconfident",
-    "biased_innovation",
-    "coloured_innovation",
-    "outliers",
-    "diverged",
-    "lag",
-}
-_OF_MODELS |= {"gate", "units_or_axes"}
+
+
+_TIMES = 3  # the tier of what is off in time: of what is no matter of a noise
 
 
 def diagnose(run: Run) -> list[Finding]:
     """The findings of a run, errors first, then by their first step.
 
-    Steps at which a sensor is found frozen are left out of what is said of the filter; while a sensor is at fault,
-    what only tells of the models is a warning at most.
+    Steps at which a sensor is found frozen are left out of what is said of the filter.
     """
     with np.errstate(all="ignore"):
         found = [finding for check in OF_SENSORS for finding in check(run)]
+        found = _without_a_wrong_gyro_s(run, found)
         faulty = [f.steps for f in found if f.code == "sensor_frozen"]
         found += sensors.saturated(run, faulty)
-        at_fault = any(f.code == "sensor_frozen" and f.severity == "error" for f in found)
         found += _failure(run)
         under_test = case(run, faulty)
         for check in OF_FILTERS:
-            found += [_softened(finding) if at_fault else finding for finding in check(under_test)]
-    return sorted(_once(found), key=lambda finding: finding.order)
+            found += check(under_test)
+        # Noises are tuned once nothing else is wrong: until then a factor on them would only hide it.
+        causes = [f for f in ranked(found) if f.severity == "error" and f.tier <= _TIMES and f.code != "start"]
+        tuned = replace(under_test, tune=not causes)
+        for check in (confidence.by_sensor, errors.by_part):
+            found += check(tuned)
+    return sorted(_once(ranked(found)), key=lambda finding: finding.order)
 
 
 def to_json(findings: list[Finding]) -> dict[str, Any]:
@@ -147,6 +153,14 @@ def codes_text() -> str:
     return "\n".join(f"{code:{width}}  {meaning}" for code, meaning in CODES.items())
 
 
+def _without_a_wrong_gyro_s(run: Run, found: list[Finding]) -> list[Finding]:
+    """Without an accelerometer's freeze that a gyro of wrong units or axes made look like one."""
+    stuck = [f for f in found if (f.code, f.sensor) == ("sensor_frozen", "accel")]
+    if stuck and any(f.sensor == "gyro" for f in kinematics.imu_axes(case(run))):
+        return [f for f in found if f not in stuck]
+    return found
+
+
 def _failure(run: Run) -> list[Finding]:
     if run.error is None:
         return []
@@ -162,12 +176,6 @@ def _failure(run: Run) -> list[Finding]:
             f"open the recording at step {step}: the stages before the failure are there",
         )
     ]
-
-
-def _softened(finding: Finding) -> Finding:
-    if finding.code in _OF_MODELS and finding.severity == "error":
-        return Finding(**(vars(finding) | {"severity": "warning"}))
-    return finding
 
 
 def _once(found: list[Finding]) -> Iterator[Finding]:

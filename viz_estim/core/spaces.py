@@ -295,7 +295,7 @@ class Product:
 def wrap(angle: Array) -> Array:
     """The same angles in [−π, π)."""
     turned = angle + np.pi
-    # Most are within already, and to see that takes a tenth of a division; for a few angles it would not pay.
+    # Most are within already: to see that takes a tenth of a division, and pays for many of them.
     if np.size(turned) > 100 and turned.min() >= 0 and turned.max() < 2 * np.pi:
         return turned - np.pi
     return turned % (2 * np.pi) - np.pi

@@ -11,19 +11,28 @@ from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.finding import Finding
 from viz_estim.scenarios.imu_health import GRAVITY
 
-EXPLAINED = 0.5  # of the misfit, for a map to be named
-_UNITS = {
-    "degrees for radians": np.pi / 180,
-    "radians for degrees": 180 / np.pi,
-    "g for m/s²": GRAVITY,
-    "m/s² for g": 1 / GRAVITY,
-    "mm for m": 1e-3,
-    "m for mm": 1e3,
+_AXES, _UNIT = 0.5, 0.9  # of the misfit, for a map to be named: a unit is off by a factor, and leaves noise alone
+UNITS = {  # by what a sensor reads: the factor that brings a reading to what was expected
+    "rad": {"degrees for radians": np.pi / 180, "radians for degrees": 180 / np.pi},
+    "m/s²": {"g for m/s²": GRAVITY, "m/s² for g": 1 / GRAVITY},
+    "m/s": {"km/h for m/s": 1 / 3.6, "m/s for km/h": 3.6, "feet for m": 0.3048, "mm for m": 1e-3, "m for mm": 1e3},
+    "m": {"mm for m": 1e-3, "m for mm": 1e3, "feet for m": 0.3048, "m for feet": 1 / 0.3048},
 }
 
 
-def maps(size: int) -> Iterator[tuple[str, Array]]:
-    """All signed permutations of the axes (2, 8 or 48), and all units, by what they say; the identity is left out."""
+def explains(title: str, explained: float) -> bool:
+    """Whether a map explains enough of the misfit to be named as its cause."""
+    return explained > (_AXES if title.startswith("axes") else _UNIT)
+
+
+def units(unit: str) -> dict[str, float]:
+    """The mistakes with a unit; all of them where it is not known."""
+    of = {"rad/s": "rad", "m/s^2": "m/s²"}.get(unit, unit)
+    return UNITS[of] if of in UNITS else {k: v for known in UNITS.values() for k, v in known.items()}
+
+
+def maps(size: int, unit: str = "") -> Iterator[tuple[str, Array]]:
+    """All signed permutations of the axes (2, 8 or 48), and the units, by what they say; the identity is left out."""
     for order in permutations(range(size)):
         for signs in product((1, -1), repeat=size):
             if order != tuple(range(size)) or -1 in signs:
@@ -31,7 +40,7 @@ def maps(size: int) -> Iterator[tuple[str, Array]]:
                 M[range(size), order] = signs
                 names = ["+" if s > 0 else "−" for s in signs]
                 yield "axes " + " ".join(f"{s}{'xyz'[o]}" for s, o in zip(names, order, strict=True)), M
-    for name, factor in _UNITS.items():
+    for name, factor in units(unit).items():
         yield name, factor * np.eye(size)
 
 

@@ -13,32 +13,91 @@ from scipy.stats import chi2, norm
 
 from viz_estim.core.consistency import squared_distance
 from viz_estim.core.quaternions import Array
+from viz_estim.diagnosis import tuning
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
 from viz_estim.diagnosis.finding import Finding, judge
 
 _GROSS = 2.0  # a covariance too small by this factor is an error, by less a warning; too large is never one
 _FEWEST = 10
+_STUCK, _BEYOND = 0.9, 10.0  # so alike and so large that no noise would make them
 _TAIL, _MANY = 1e-3, 0.05
+_MOST, _MIDDLE = 0.2, 1.5
 
 
 def by_sensor(case: Case) -> Iterator[Finding]:
     """Mean NIS of a sensor outside its χ² band: the sum of N of them is χ²(N·dof) (eq. 5.4.2-9)."""
+    spoken = False
     for name, readings in case.sensors.items():
         N, dof = len(readings), readings.dof
         if N < _FEWEST:
             continue
         ratio, p = size(readings.nis, dof)
-        severity = judge(p, 2 * len(case.sensors), large=ratio > _GROSS)
-        if severity is None:
+        if judge(p, 2 * len(case.sensors), large=False) is None:
             continue
         over = ratio > 1
-        factor, rho = factor_on_noise(readings.pick(~_far(readings.nis, dof))), lag_one(readings.white)
-        if factor is not None and (factor > 1) != over:
+        tuned, rho = tuning.factors(case) if case.tune else {}, lag_one(readings.white)
+        factor = tuned[name].factor if name in tuned else factor_on_noise(readings.pick(~_far(readings.nis, dof)))
+        if factor is not None and ((factor > 1) != over or not 1e-4 < factor < 1e4):
             factor = None
         evidence = {"mean_nis": float(readings.nis.mean()), "dof": dof, "readings": N, "p": p, "factor_on_R": factor}
+        process = None
+        if "Q" in tuned:
+            evidence["factor_on_Q"] = tuned["Q"].factor
+            evidence |= {f"gain_by_{'R' if k == name else k}": tuned[k].gain for k in (name, "Q") if k in tuned}
+            if tuned["Q"].gain > tuned[name].gain and (tuned["Q"].factor > 1) == over and tuned["Q"].known:
+                process = tuned["Q"].factor
         evidence["autocorrelation"] = rho
+        severity = judge(p, 2 * len(case.sensors), large=ratio > _GROSS or (process or 0) > _GROSS**2)
+        assert severity
+        spoken = spoken or process is not None or (rho > _STUCK and ratio > _BEYOND)
         code = "overconfident" if over else "underconfident"
-        yield Finding(code, severity, name, readings.steps, evidence, *_words(case, readings, ratio, factor, rho))
+        words = _words(case, readings, ratio, factor, process, rho)
+        yield Finding(code, severity, name, readings.steps, evidence, *words)
+    if not spoken:
+        yield from _by_process(case)
+
+
+def _by_process(case: Case) -> Iterator[Finding]:
+    """The likelihood ratio of another Q (`tuning`): twice its logarithm is χ²(1) if Q is right (Wilks 1938).
+
+    It tells a wrong Q from innovations whose size is right and whose order is not. Only looked at where innovations
+    look odd at the level of 0.05, by their size or by Ljung and Box, which can but lower its false alarms.
+    """
+    looks = [min(size(r.nis, r.dof)[1], ljung_box(r)) for r in case.sensors.values() if len(r) >= 2 * _FEWEST]
+    if not case.tune or not looks or min(looks) > 0.05:
+        return
+    tuned = tuning.factors(case)
+    if "Q" not in tuned or any(tuned[name].gain > tuned["Q"].gain for name in tuned):
+        return
+    factor, gain = tuned["Q"]
+    if not tuned["Q"].known:
+        return
+    p, over = float(chi2.sf(2 * gain, 1)), factor > 1
+    severity = judge(p, 1, large=factor > _GROSS**2)
+    if severity:
+        yield Finding(
+            "overconfident" if over else "underconfident", severity, None, case.whole,
+            {"factor_on_Q": factor, "log_likelihood_gain": gain, "p": p},
+            f"the process noise Q is {factor if over else 1 / factor:.2g}× too {'small' if over else 'large'} by the "
+            "likelihood of the innovations, or the model lacks a motion",
+            _more_noise(factor),
+        )  # fmt: skip
+
+
+def _more_noise(factor: float) -> str:
+    return (
+        f"multiply Q by about {factor:.2g}, its standard deviations by {factor**0.5:.2g}; where the model lacks a "
+        "motion, add that to the state instead"
+    )
+
+
+def ljung_box(readings: Readings, lags: int = 10) -> float:
+    """The chance of innovations so coloured (Ljung and Box 1978)."""
+    white, N = readings.white - readings.white.mean(0), len(readings)
+    total = np.maximum((white**2).sum(0), 1e-300)
+    rho = np.stack([(white[k:] * white[:-k]).sum(0) / total for k in range(1, min(lags, N // 5) + 1)])
+    Q = N * (N + 2) * float((rho**2 / (N - np.arange(1, len(rho) + 1))[:, None]).sum())
+    return float(chi2.sf(Q, rho.size))
 
 
 def size(nis: Array, dof: int) -> tuple[float, float]:
@@ -59,9 +118,10 @@ def size(nis: Array, dof: int) -> tuple[float, float]:
 
 
 def _far(nis: Array, dof: int) -> np.ndarray:
-    """Which NIS (M,) are a matter of outliers; none where so many are far that it is the noise."""
+    """Which NIS (M,) are a matter of outliers; none where so many are far, and the middle too, that it is the noise."""
     far = nis > chi2.isf(_TAIL, dof)
-    return far if far.mean() <= _MANY else np.zeros(len(nis), bool)
+    held = np.median(nis) < _MIDDLE * chi2.median(dof) and far.mean() <= _MOST
+    return far if far.mean() <= _MANY or held else np.zeros(len(nis), bool)
 
 
 def factor_on_noise(readings: Readings) -> float | None:
@@ -85,8 +145,10 @@ def lag_one(white: Array) -> float:
     return float((white[1:] * white[:-1]).sum() / total) if total > 0 else 0.0
 
 
-def _words(case: Case, readings: Readings, ratio: float, factor: float | None, rho: float) -> tuple[str, str]:
-    """Cause and remedy. Innovations that follow one another tell a Q too small from an R too small (Mehra 1970)."""
+def _words(
+    case: Case, readings: Readings, ratio: float, factor: float | None, process: float | None, rho: float
+) -> tuple[str, str]:
+    """Cause and remedy. factor: on R; process: on Q, where that explains the innovations better."""
     name = readings.name
     size = f"innovations of {name} are {ratio**0.5:.2g}× as large as S says (mean NIS {ratio:.2g} of what it should be)"
     noise = parameter(case.run, f"{name}_noise")
@@ -97,69 +159,21 @@ def _words(case: Case, readings: Readings, ratio: float, factor: float | None, r
         tuned = f"no R alone would explain it: look at the process noise of what {name} sees"
     else:
         tuned = f"set {where} to about {now * factor**0.5:.2g} (it is {now:.2g})"
-    if ratio > 1 and rho > 0.2:
+    if rho > _STUCK and ratio > _BEYOND:
         return (
-            f"{size}, and each is like the one before (autocorrelation {rho:.2f}): the state lags behind, as with a "
-            "process noise Q that is too small or a motion that the model lacks",
-            f"raise the process noise until the autocorrelation is gone; if that does not help, {tuned}",
+            f"{size}, and each is like the one before (autocorrelation {rho:.2f}): the estimate goes another way than "
+            f"{name}, which no noise does",
+            f"check the order, the signs and the units of {name} and of the control, and the start; tune noises after",
+        )
+    if process is not None:
+        wrong = f"{process:.2g}× too small" if process > 1 else f"{1 / process:.2g}× too large"
+        return (
+            f"{size}: the process noise Q is {wrong} (R alone would explain it less well), or the model misses what "
+            f"moves {name}",
+            _more_noise(process),
         )
     if ratio > 1:
         by = "too small" if factor is None else f"{factor:.2g}× too small"
         return f"{size}: R of {name} is {by}, or the model misses what moves it", tuned
     by = "too large" if factor is None or factor == 0 else f"{1 / factor:.2g}× too large"
     return f"{size}: R of {name} is {by}, or Q is", tuned
-
-
-def by_part(case: Case) -> Iterator[Finding]:
-    """Mean NEES of each part of the state, where truth is known, against χ² of as many errors as are independent.
-
-    Errors are not white: of T there are T/τ independent ones, with τ = 1 + 2·Σρₖ² of the whitened errors'
-    autocorrelation about zero, up to its first ρₖ < 0.05 (Geyer 1992: an initial positive sequence). Twice that τ is
-    taken, for it is an estimate itself.
-    """
-    run = case.run
-    if run.labels or "mean" not in run.ends:
-        return
-    counts = run.step >= case.first
-    found = []
-    for name, part in case.space.parts.items():
-        at, axes = case.space.at[name], case.space.axes_at[name]
-        error = part.minus(run.mean[:, at], run.truth[:, at])
-        P = run.cov[:, axes, axes]
-        rows = counts & np.isfinite(error).all(1) & np.isfinite(P).all((1, 2))
-        rows[rows] &= np.linalg.eigvalsh(P[rows])[:, 0] > 1e-12 * np.trace(P[rows], axis1=1, axis2=2)
-        if rows.sum() >= _FEWEST:
-            white = np.linalg.solve(np.linalg.cholesky(P[rows]), error[rows][..., None])[..., 0]
-            found.append((name, run.step[rows], white))
-    for name, steps, white in found:
-        T, dof = white.shape
-        mean = float((white**2).sum() / T)
-        independent = max(1.0, T / (2 * _correlation_time(white)))
-        total = mean * independent
-        p = 2 * min(chi2.sf(total, dof * independent), chi2.cdf(total, dof * independent))
-        ratio = mean / dof
-        severity = judge(p, 2 * len(found), large=ratio > _GROSS**2)
-        if severity is None:
-            continue
-        evidence = {"part": name, "mean_nees": mean, "dof": dof, "independent": independent, "p": p}
-        code = "overconfident" if ratio > 1 else "underconfident"
-        what = f"the error of {name} is {ratio**0.5:.2g}× as large as its covariance says"
-        if ratio > 1:
-            cause = (
-                f"{what}: {name} carries the inconsistency; its process or initial noise is too small, or it is biased"
-            )
-            remedy = f"raise the noise that moves {name}; look for a bias in the sensors that tell of it"
-        else:
-            cause, remedy = f"{what}: it is better known than the filter believes", f"lower the noise that moves {name}"
-        yield Finding(code, severity, None, (int(steps[0]), int(steps[-1])), evidence, cause, remedy)
-
-
-def _correlation_time(white: Array) -> float:
-    """τ of the squares: 1 + 2·Σρₖ², with ρₖ about zero, since a whitened error's mean is known to be that."""
-    T = len(white)
-    spectrum = np.fft.rfft(white, 2 * T, axis=0)
-    rho = np.fft.irfft((np.abs(spectrum) ** 2).sum(1))[:T]
-    rho = rho / max(rho[0], 1e-300)
-    small = np.flatnonzero(rho < 0.05)
-    end = int(small[0]) if len(small) else T
-    return float(1 + 2 * (rho[1:end] ** 2).sum())

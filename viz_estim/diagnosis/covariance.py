@@ -11,39 +11,47 @@ from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import Finding
 
-_ASYMMETRY = 1e-9  # of the largest entry; rounding leaves 1e-15
-_NEGATIVE = -1e-9  # an eigenvalue of the correlation matrix
-_CONDITION = 1e12  # of the correlation matrix: beyond, a solve has four digits left
-_COLLAPSED = 1e-6  # of the standard deviation at the start
+_HALF = float(np.sqrt(np.finfo(float).eps))  # half of the digits: what is beyond is no rounding that piled up
 _LEAK, _GREAT_LEAK = 0.02, 0.2  # the logarithm of what is claimed of a blind direction; a sound filter leaves 1e-6
 
 
 def broken(case: Case) -> Iterator[Finding]:
     """Not symmetric, not positive definite, or ill-conditioned; by the correlation matrix, so that units play no part.
 
-    Deterministic: no sound covariance is any of these, whatever the data.
+    No sound covariance is any of these whatever the data, so that the bounds are of rounding. A product of d × d
+    matrices is off by d·ε of its terms (Higham 2002, section 3.5), and the terms of an update are as large as the
+    covariance before it: of the one after it that is d·ε·g, with g the largest ratio of a variance before to after. It
+    piles up over the run's T updates as √T at most where rounding is fair. ε is that of the numbers that are held
+    (float32 where all of them are). Ill-conditioned: a solve loses d·ε·κ (Higham, section 7.2), which must stay below
+    what the tests here resolve, √(2/T).
     """
     if case.run.properties.get("belief") == "Particles":  # a cloud's covariance may be of any rank
         return
     tables = [(name, t) for name, t in case.run.stages.items() if "cov" in t.values and name != "start"]
     worst: dict[str, list[tuple[int, float, str]]] = {}
     for name, table in tables:
-        P = table.cov
-        rows = np.flatnonzero(np.isfinite(P).all((1, 2)) & (np.abs(P).max((1, 2)) > 0))
-        P = P[rows]
-        largest = np.abs(P).max((1, 2))
-        skew = np.abs(P - np.swapaxes(P, 1, 2)).max((1, 2)) / largest
+        before = case.sequence.before(table)[1]
+        rows = np.flatnonzero(np.isfinite(table.cov).all((1, 2)) & (np.abs(table.cov).max((1, 2)) > 0))
+        P = table.cov[rows]
+        d, T = P.shape[-1], max(len(case.run.step), 2)
         variance = np.diagonal(P, axis1=1, axis2=2)
+        past = np.nan_to_num(np.diagonal(before[rows], axis1=1, axis2=2))
         std = np.sqrt(np.where(variance > 0, variance, 1.0))
-        correlation = P / (std[:, :, None] * std[:, None, :])
-        known = np.where((variance > 0)[:, :, None] & (variance > 0)[:, None, :], correlation, np.eye(P.shape[-1]))
-        values = np.linalg.eigvalsh(0.5 * (known + np.swapaxes(known, 1, 2)))
+        growth = np.maximum(np.max(past / np.where(variance > 0, variance, np.inf), axis=1, initial=0.0), 1.0)
+        known = (variance > 0)[:, :, None] & (variance > 0)[:, None, :]
+        correlation = np.where(known, P / (std[:, :, None] * std[:, None, :]), np.eye(d))
+        rounding = 8 * d * _epsilon(P) * growth * np.sqrt(T)
+        skew = np.abs(correlation - np.swapaxes(correlation, 1, 2)).max((1, 2))
+        values = np.linalg.eigvalsh(0.5 * (correlation + np.swapaxes(correlation, 1, 2)))
         negative = np.minimum(values[:, 0], np.where(variance < 0, -1.0, 0.0).min(1))
-        condition = np.where(values[:, 0] > 0, values[:, -1] / np.maximum(values[:, 0], 1e-300), 0.0)
+        condition = np.where(values[:, 0] > 0, values[:, -1] / np.maximum(values[:, 0], 1e-300), np.inf)
+        # A variance of zero is a state that is given; it tells of no combination that is.
+        singular = d * np.finfo(float).eps * condition > np.sqrt(2 / T)
         for kind, figure, bad in (
-            ("asymmetric", skew, skew > _ASYMMETRY),
-            ("negative", -negative, negative < _NEGATIVE),
-            ("ill-conditioned", condition, condition > _CONDITION),
+            ("asymmetric", skew, skew > np.maximum(rounding, _HALF)),
+            ("rounding", skew, (skew > rounding) & (skew <= _HALF)),
+            ("negative", -negative, negative < -np.minimum(rounding, 0.5)),
+            ("ill-conditioned", condition, singular & (negative >= -np.minimum(rounding, 0.5))),
         ):
             of = table.step[rows]
             worst.setdefault(kind, []).extend(
@@ -53,15 +61,66 @@ def broken(case: Case) -> Iterator[Finding]:
         if found:
             steps = min(step for step, _, _ in found), max(step for step, _, _ in found)
             _, most, stage = max(found, key=lambda entry: entry[1])
-            evidence = {"kind": kind, "worst": most, "stage": stage, "count": len(found)}
-            severity = "warning" if kind == "ill-conditioned" else "error"
+            evidence = {"kind": kind, "worst": most if np.isfinite(most) else None, "stage": stage, "count": len(found)}
+            severity = {"ill-conditioned": "warning", "rounding": "note"}.get(kind, "error")
             yield Finding("covariance", severity, None, steps, evidence, *_WORDS[kind])  # type: ignore[arg-type]
+
+
+def _epsilon(P: Array) -> float:
+    """The rounding of numbers, a float32's where all of them are such."""
+    single = np.array_equal(P.astype(np.float32).astype(float), P) and np.unique(P).size > P.shape[-1] ** 2
+    return float(np.finfo(np.float32 if single else float).eps)
+
+
+def claims(case: Case) -> Iterator[Finding]:
+    """An update that leaves less than a reading can: P⁺ ≥ P − C·S⁻¹·Cᵀ for any gain (Kalman's is the best).
+
+    Carried to the tangent space at the new mean. By the eigenvalues of P⁺ over that bound, which no sound update has
+    below 1 by more than rounding: half of the digits, times the ratio of the variances before and after.
+    """
+    for table in case.run.stages.values():
+        if not {"innovation.cross_cov", "innovation.cov", "cov"} <= table.values.keys():
+            continue
+        mean, before = case.sequence.before(table)
+        C, S = table.values["innovation.cross_cov"], table.values["innovation.cov"]
+        numbers = (before, S, table.cov, C)
+        rows = np.asarray(np.all([np.isfinite(A).all((1, 2)) for A in numbers], axis=0))
+        rows[rows] &= _sound(before[rows]) & _sound(S[rows]) & _sound(table.cov[rows])
+        if not rows.any():
+            continue
+        least = before[rows] - C[rows] @ np.linalg.solve(S[rows], np.swapaxes(C[rows], 1, 2))
+        if not case.space.flat:
+            A = case.space.transport(mean[rows], case.space.minus(table.mean[rows], mean[rows]))
+            least = A @ least @ np.swapaxes(A, 1, 2)
+        least = 0.5 * (least + np.swapaxes(least, 1, 2))
+        fine = _sound(least)
+        if not fine.any():
+            continue
+        L = np.linalg.cholesky(least[fine])
+        inside = np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, table.cov[rows][fine]), 1, 2))
+        ratio = np.linalg.eigvalsh(0.5 * (inside + np.swapaxes(inside, 1, 2)))[:, 0]
+        shrunk = np.diagonal(before[rows][fine], axis1=1, axis2=2) / np.diagonal(least[fine], axis1=1, axis2=2)
+        bad = ratio < 1 - np.minimum(_HALF * 100 * shrunk.max(1), 0.5)
+        if bad.sum() > 1:
+            of = table.step[rows][fine][bad]
+            worst = float(ratio[bad].min())
+            yield Finding(
+                "covariance", "error" if np.median(ratio[bad]) < 0.9 else "warning", None, (int(of[0]), int(of[-1])),
+                {"kind": "claims", "least_ratio": worst, "stage": table.name, "count": int(bad.sum())},
+                f"at {int(bad.sum())} updates the covariance shrinks by more than the reading can tell (down to "
+                f"{worst:.2g} of the least variance that any gain leaves)",
+                "check P⁺ = (I − K·H)·P: its gain, its S, and that it is taken off once; write it in Joseph's form",
+            )  # fmt: skip
 
 
 _WORDS = {
     "asymmetric": (
         "the covariance is not symmetric: a product in its update lacks a transpose, or is taken in another order",
         "write the update in Joseph's form, (I−KH)·P·(I−KH)ᵀ + K·R·Kᵀ, and symmetrise once, ½(P + Pᵀ)",
+    ),
+    "rounding": (
+        "the covariance is no longer symmetric in its last digits: rounding piles up from step to step",
+        "symmetrise once a step, ½(P + Pᵀ)",
     ),
     "negative": (
         "the covariance is not positive definite: more was subtracted than there was, as by (I−KH)·P with a gain that "
@@ -76,9 +135,13 @@ _WORDS = {
 
 
 def bounds(case: Case) -> Iterator[Finding]:
-    """A part that is taken as known exactly in the end (σ below 10⁻⁶ of its start), or that grows without bound.
+    """A part that becomes known exactly, or that grows without bound.
 
-    Growing: σ rises through the last half of the run, and ends at ten times its start, although readings come.
+    Collapsing: σ falls faster, over each eighth of the run's last half, than readings of a motion without noise let it:
+    of d states that move as a polynomial, none falls faster than t^−(d − ½) (least squares of a polynomial's
+    coefficients). Or it is below the rounding of the part's own numbers, ε·|x|, so that no reading moves the mean any
+    more. Growing: over each of these eighths the variance gains at least as much as over the one before, as that of a
+    random walk which no reading bounds, and doubles; it is a note, for it may be honest.
     """
     run = case.run
     if run.labels or "cov" not in run.ends or not case.sensors:
@@ -86,23 +149,28 @@ def bounds(case: Case) -> Iterator[Finding]:
     rows = np.flatnonzero((run.step >= case.first) & np.isfinite(run.cov).all((1, 2)))
     if len(rows) < 20:
         return
+    ends = rows[np.linspace(len(rows) // 2, len(rows) - 1, 5).astype(int)]
+    elapsed = run.time[ends] - run.time[rows[0]]
+    fastest = (elapsed[1:] / np.maximum(elapsed[:-1], 1e-12)) ** -(len(case.space.axes) - 0.5)
     for name in case.space.parts:
-        axes = case.space.axes_at[name]
-        sigma = np.sqrt(np.maximum(np.diagonal(run.cov[rows], axis1=1, axis2=2)[:, axes], 0)).max(1)
-        if sigma[0] > 0 and sigma[-1] < _COLLAPSED * sigma[0]:
-            at = int(run.step[rows[np.argmax(sigma < _COLLAPSED * sigma[0])]])
+        axes, at = case.space.axes_at[name], case.space.at[name]
+        sigma = np.sqrt(np.maximum(np.diagonal(run.cov, axis1=1, axis2=2)[:, axes], 0)).max(1)
+        falls = sigma[ends[1:]] / np.maximum(sigma[ends[:-1]], 1e-300)
+        deaf = sigma[rows] < np.finfo(float).eps * np.abs(run.mean[rows][:, at]).max()
+        if sigma[rows[0]] > 0 and ((falls < 0.999 * fastest).all() or (deaf[-1] and not deaf[0])):
+            step = int(run.step[rows[int(np.argmax(deaf))]] if deaf.any() else run.step[ends[0]])
             yield Finding(
-                "covariance", "error", None, (at, int(run.step[rows[-1]])), {"kind": "collapsed", "part": name},
+                "covariance", "error", None, (step, int(run.step[rows[-1]])), {"kind": "collapsed", "part": name},
                 f"the covariance of {name} collapses towards zero: the filter is sure, and deaf to what comes",
                 f"give {name} process noise: without any, each reading only makes it surer",
             )  # fmt: skip
-        half = sigma[len(sigma) // 2 :]
-        quarters = [float(piece.max()) for piece in np.array_split(half, 4)]
-        if sigma[-1] > 10 * max(sigma[0], 1e-300) and quarters == sorted(quarters) and quarters[-1] > 1.2 * quarters[0]:
-            at = int(run.step[rows[len(sigma) // 2]])
-            evidence = {"kind": "growing", "part": name, "start": float(sigma[0]), "end": float(sigma[-1])}
+        gains = np.diff(sigma[ends] ** 2) / np.maximum(np.diff(elapsed), 1e-12)
+        if (gains[1:] > 0.999 * gains[:-1]).all() and gains[0] > 0 and sigma[rows[-1]] ** 2 > 2 * sigma[rows[0]] ** 2:
+            evidence = {
+                "kind": "growing", "part": name, "start": float(sigma[rows[0]]), "end": float(sigma[rows[-1]])
+            }  # fmt: skip
             yield Finding(
-                "covariance", "note", None, (at, int(run.step[rows[-1]])), evidence,
+                "covariance", "note", None, (int(run.step[ends[0]]), int(run.step[rows[-1]])), evidence,
                 f"the covariance of {name} grows without bound: no sensor tells of it",
                 f"if a sensor should see {name}, check its Jacobian; else this is dead reckoning, and honest",
             )  # fmt: skip

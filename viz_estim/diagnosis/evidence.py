@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from viz_estim.core.spaces import Product, Space
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.reader import Run
 from viz_estim.recording.tables import StageTable
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,7 @@ class Case:
     run: Run
     sensors: dict[str, Readings]
     sequence: Sequence
+    tune: bool = True  # whether noises are worth tuning: nothing else is known to be wrong
 
     @property
     def space(self) -> Product:
@@ -168,5 +171,48 @@ def case(run: Run, faulty: Iterable[tuple[int, int]] = ()) -> Case:
     return Case(run, sensors(run, np.concatenate(without) if without else np.empty(0, int)), Sequence(run))
 
 
+def once(case: Case, name: str, make: Callable[[Case], T]) -> T:
+    """What `make` finds of a case, kept under a name for whoever asks next."""
+    if not hasattr(case, name):
+        object.__setattr__(case, name, make(case))
+    found: T = getattr(case, name)
+    return found
+
+
 def units(space: Space) -> set[str]:
     return set(space.axis_units)
+
+
+def jacobians(P: Array, C: Array) -> Array:
+    """H (M, m, d) = Cᵀ·P⁻¹ of cross-covariances C (M, d, m), NaN where P is not finite; by the pseudo-inverse where
+    one is singular."""
+    H = np.full((*C.shape[:1], C.shape[2], C.shape[1]), np.nan)
+    ok = np.isfinite(P).all((1, 2)) & np.isfinite(C).all((1, 2))
+    if (np.linalg.cond(P[ok]) < 1e13).all():
+        solved = np.linalg.solve(P[ok], C[ok])
+    else:
+        solved = np.linalg.pinv(P[ok], rcond=1e-12, hermitian=True) @ C[ok]
+    H[ok] = np.swapaxes(solved, 1, 2)
+    return H
+
+
+def transitions(case: Case, table: StageTable) -> Array | None:
+    """F (M, d, d) of a prediction: as recorded, or by least squares over its sigma points."""
+    if "transition" in table.values and table.values["transition"].shape[1:] == case.run.cov.shape[1:]:
+        return table.values["transition"]
+    drawn, moved = table.values.get("drawn.points"), table.values.get("propagated.points")
+    if drawn is None or moved is None or np.isnan(drawn).any() or np.isnan(moved).any():
+        return None
+    space: Any = case.space
+    mean, _ = case.sequence.before(table)
+    d, extra = len(space.axes), drawn.shape[-1] - len(space.names)
+    x = space.minus(drawn[..., : len(space.names)], mean[:, None, :])
+    if extra:  # noise among the points
+        x = np.concatenate([x, drawn[..., len(space.names) :]], axis=-1)
+    y = space.minus(moved, table.mean[:, None, :])
+    # Scaled, since states of very unlike size would lose the small ones.
+    size = np.maximum(np.abs(x).max(1, keepdims=True), 1e-12)
+    x = x / size
+    xT = np.swapaxes(x, 1, 2)
+    fit = np.linalg.pinv(xT @ x, rcond=1e-10, hermitian=True) @ (xT @ y)
+    return np.swapaxes(fit / np.swapaxes(size, 1, 2), 1, 2)[:, :, :d]

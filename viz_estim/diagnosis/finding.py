@@ -32,19 +32,33 @@ CODES = {
     "unobservable_update": "an update gains information on a direction that its sensor cannot see",
     "angle_wrap": "innovations near a full turn, quaternions off the sphere, or sign flips",
     "units_or_axes": "swapped axes, a sign or another unit would explain the readings",
+    "process_model": "the prediction does not move the state as the truth moves: a factor, a sign or a drift",
+    "start": "the first belief is further from the truth than its covariance says",
     "jacobian": "a Jacobian is not the derivative of the model that it stands for",
     "noisy_prediction": "the prediction moves the mean at random: a sample of the noise was added to it",
     "particles_collapsed": "hardly any distinct particles or weights are left",
+    "particles_far": "no particle is where the readings are",
     "particles_clamped": "particles are held at a bound",
     "several_modes": "the particles form several clouds, between which the mean lies",
     "icp_not_converged": "the iterations ended before the matches repeated",
     "icp_few_matches": "hardly any points have a match",
     "icp_rmse_rises": "the matches' RMSE rises while their number does not",
 }
+# What may follow from what: an error of one tier makes those of later ones follow from it. First what the sensors, the
+# stamps and the filter's own numbers are; then what the models take them for; what is refused; what is off in time, and
+# on the average; last what all of these do to innovations and errors.
+_LATER = (
+    {"units_or_axes", "process_model", "start"},
+    {"gate"},
+    {"lag"},
+    {"biased_innovation"},
+    {"overconfident", "underconfident", "coloured_innovation", "outliers", "diverged"},
+)
+SYMPTOMS = _LATER[-1]
 _ORDER: tuple[Severity, ...] = ("error", "warning", "note")
 
 _BUDGET: dict[Severity, float] = {"error": 1e-4, "warning": 0.05}  # false alarms a run
-_FAMILIES = 20  # statistical checks: each has an equal share, and shares it out among what it tests
+_FAMILIES = 30  # statistical checks: each has an equal share, and shares it out among what it tests
 
 
 @dataclass(frozen=True)
@@ -63,9 +77,14 @@ class Finding:
         return asdict(self) | {"steps": list(self.steps)}
 
     @property
-    def order(self) -> tuple[int, int]:
-        """Errors first, then by when it began."""
-        return _ORDER.index(self.severity), self.steps[0]
+    def tier(self) -> int:
+        """How far down the chain of causes it stands, from 0."""
+        return next((i for i, codes in enumerate(_LATER, 1) if self.code in codes), 0)
+
+    @property
+    def order(self) -> tuple[int, int, int]:
+        """Errors first, then by when it began; of one step, causes before what follows from them."""
+        return _ORDER.index(self.severity), self.steps[0], self.tier
 
 
 def level(severity: Severity, tests: int) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 
 from viz_estim.core.consistency import squared_distance
 from viz_estim.core.spaces import SO3, Euclidean
-from viz_estim.diagnosis.axes import EXPLAINED, finding_of, maps
+from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import Finding, level
 from viz_estim.diagnosis.kinematics import imu_axes
@@ -91,12 +91,12 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         if told or not isinstance(space, Euclidean) or not 1 <= len(space.axes) <= 3 or len(readings) < 10:
             continue
         own = float(np.nansum(readings.nis))
-        candidates = list(maps(len(space.axes)))
+        candidates = list(maps(len(space.axes), space.axis_units[0]))
         best, what = np.inf, ""
         for title, M in candidates:
             value = float(np.nansum(squared_distance(readings.z @ M.T - readings.predicted, readings.cov)))
             if value < best:
                 best, what = value, title
         gain, explained = 0.5 * (own - best), 1 - best / max(own, 1e-300)
-        if gain > -np.log(level("error", 60 * len(case.sensors))) and explained > EXPLAINED:
+        if gain > -np.log(level("error", 60 * len(case.sensors))) and explains(what, explained):
             yield finding_of(name, readings.steps, what, explained, gain)

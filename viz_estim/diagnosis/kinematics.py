@@ -9,7 +9,7 @@ import numpy as np
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3
-from viz_estim.diagnosis.axes import EXPLAINED, finding_of, maps
+from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import Finding, level
 from viz_estim.diagnosis.sensors import Imu, imu
@@ -37,7 +37,7 @@ def imu_axes(case: Case) -> Iterator[Finding]:
         return
     turn, middle, change, steps = pieces
     own = _left(turn, middle, change)
-    candidates = list(maps(3))
+    candidates = list(maps(3, "rad/s"))
     of_rate = [_left(turn @ M.T, middle, change) for _, M in candidates]
     of_force = [
         _left(turn, middle @ M.T, change @ M.T) if abs(np.linalg.det(M)) == 1 else np.inf for _, M in candidates
@@ -46,15 +46,17 @@ def imu_axes(case: Case) -> Iterator[Finding]:
     least = min(*of_rate, *of_force)
     variance = max(least, 1e-12) / change.size
     gain, explained = 0.5 * (own - least) / variance / _DEPENDENT, 1 - least / max(own, 1e-300)
-    if gain > -np.log(level("error", 2 * len(candidates))) and explained > EXPLAINED:
+    nothing = float(np.square(change).sum())  # what no turn at all would leave: a map that is no better is none
+    if gain > -np.log(level("error", 2 * len(candidates))):
         blamed = _blamed(case, both)
         if blamed == "accel" and min(of_force) < 1.5 * least:
             name, what = "accel", candidates[int(np.argmin(of_force))][0]
         else:
             name, what = "gyro", candidates[int(np.argmin(of_rate))][0]
-        yield finding_of(name, steps, what, explained, gain)
+        if explains(what, explained) and least < 0.5 * nothing:
+            yield finding_of(name, steps, what, explained, gain)
     if not 0.5 < length / GRAVITY < 2:
-        factor = min((abs(np.log(length * M[0, 0] / GRAVITY)), t) for t, M in candidates if t[:4] != "axes")
+        factor = min((abs(np.log(length * M[0, 0] / GRAVITY)), t) for t, M in maps(3, "m/s²") if t[:4] != "axes")
         if factor[0] < 0.2:
             yield finding_of("accel", steps, factor[1], 1 - abs(1 - np.exp(factor[0])), float(len(both.rows)))
 

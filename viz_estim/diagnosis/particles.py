@@ -5,19 +5,32 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.stats import binom, chi2
 
-from viz_estim.core.modes import modes
+from viz_estim.core.consistency import squared_distance
+from viz_estim.core.modes import modes, moments
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import Space
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import Finding
+from viz_estim.diagnosis.finding import Finding, level
 
-_FEW = 0.02  # of the particles: fewer distinct ancestors or effective particles, and the cloud is copies of a few
-_PILED = 0.02  # the share of a cloud that holds one and the same number; chance gives none
-_APART = 3.0  # standard deviations of the heaviest mode from the cloud's mean
-_FAR = 1e-3  # how well the best particle explains a reading, against a cloud that was drawn around it
+_LOOKED_AT = 200  # steps at most, at which modes are looked for
+
+# Fewer effective particles than this, and the cloud's variance is too small by more than a factor of 2 in more than one
+# of twenty cases: with n independent ones it is χ²(n − 1)/(n − 1) of the true one.
+_GROSS, _ONE_IN_TWENTY = 2.0, 0.05
+_FEW = next(n for n in range(2, 100) if chi2.cdf((n - 1) / _GROSS, n - 1) < _ONE_IN_TWENTY)
+_HELD = 0.02  # the share of a cloud at a bound that pulls its mean
+_NEAR = 0.1  # the share of a normal cloud that lies about its mean, to be held against what does
 
 
 def collapsed(case: Case) -> Iterator[Finding]:
-    """Effective sample size 1/Σw² (Kong, Liu and Wong 1994) and distinct ancestors, as shares of the particles."""
+    """Effective sample size 1/Σw² (Kong, Liu and Wong 1994) and distinct ancestors: fewer than 17.
+
+    A cloud is a sample: its variance is too small by more than a factor of 2 in one of twenty cases where it has 17
+    independent particles, and more often below (χ²). A single time at the start is a warning, for a first reading may
+    well be far narrower than all that was possible.
+    """
     run = case.run
     low: list[int] = []
     least, count = np.inf, 0
@@ -25,7 +38,7 @@ def collapsed(case: Case) -> Iterator[Finding]:
         for name in ("ess", "distinct"):
             if name in table.values and "states" in table.values and table.values[name].ndim == 1:
                 count = count if count else table.values["states"].shape[1]
-                rows = (table.values[name] < max(_FEW * _count(case), 1.5)) & (table.step >= case.first)
+                rows = (table.values[name] < min(_FEW, 0.5 * _count(case))) & (table.step >= case.first)
                 low += table.step[rows].tolist()
                 if rows.any():
                     least = min(least, float(table.values[name][rows].min()))
@@ -53,8 +66,13 @@ def _count(case: Case) -> int:
 
 
 def clamped(case: Case) -> Iterator[Finding]:
-    """Particles that are held at a bound: many share one extreme number that are no copies of one another."""
+    """Particles that are held at a bound: several share one extreme number that are no copies of one another.
+
+    Of N draws of a continuous number two are equal with N²·ε at most (a birthday among 1/ε values), so that three that
+    are is no chance. An error where the share that is held moves the mean.
+    """
     found: list[int] = []
+    most = 0.0
     for table in case.run.stages.values():
         if not table.name.startswith("predict") or "states" not in table.values:
             continue
@@ -63,13 +81,13 @@ def clamped(case: Case) -> Iterator[Finding]:
                 continue
             for x in cloud.T:
                 for end in (x.min(), x.max()):
-                    if end != x.mean() and (x == end).mean() > _PILED and (x == end).sum() > 3:
-                        others = np.unique(cloud[x == end], axis=0)
-                        if len(others) > 2:
-                            found.append(int(table.step[row]))
+                    if end != x.mean() and (x == end).sum() > 2 and len(np.unique(cloud[x == end], axis=0)) > 2:
+                        found.append(int(table.step[row]))
+                        most = max(most, float((x == end).mean()))
     if found:
         yield Finding(
-            "particles_clamped", "error", None, (min(found), max(found)), {"steps": len(set(found))},
+            "particles_clamped", "error" if most > _HELD else "warning", None, (min(found), max(found)),
+            {"steps": len(set(found)), "largest_share": most},
             f"at {len(set(found))} steps many particles share the very same number at the edge of the cloud: they are "
             "held at a bound, where they pile up and pull the mean",
             "let particles leave the area, and let their likelihood deal with them; or draw those anew that leave",
@@ -77,9 +95,14 @@ def clamped(case: Case) -> Iterator[Finding]:
 
 
 def several_modes(case: Case) -> Iterator[Finding]:
-    """Clouds of at least 5 % of the weight each, between which the mean lies (`core.modes`)."""
+    """Clouds of at least 5 % of the weight each (`core.modes`), between which the mean lies.
+
+    A warning where the mean is where nobody is: of as many independent particles as the effective sample size says, a
+    normal cloud has a tenth within χ²'s quantile of 0.1 about its mean; how few do is binomial.
+    """
     run = case.run
     apart: list[int] = []
+    empty: list[int] = []
     ends = [table for table in run.stages.values() if "states" in table.values]
     if not ends:
         return
@@ -88,16 +111,65 @@ def several_modes(case: Case) -> Iterator[Finding]:
         for row, (step, place) in enumerate(zip(table.step.tolist(), table.place.tolist(), strict=True)):
             if step not in last or place > last[step][0]:
                 last[step] = place, i, row
-    for step, (_, i, row) in last.items():
+    every = max(1, -(-len(last) // _LOOKED_AT))
+    looked = [at for k, at in enumerate(last.items()) if k % every == 0]
+    for step, (_, i, row) in looked:
         states, weights = ends[i].values["states"][row], ends[i].values["log_weights"][row]
         if np.isfinite(states).all() and np.isfinite(weights).all() and len(modes(run.space, states, weights)) > 1:
             apart.append(step)
+            if _hollow(run.space, states, weights) < level("warning", len(looked)):
+                empty.append(step)
     if len(apart) > 2:
-        share = len(apart) / len(run.step)
-        at_end = max(apart) == int(run.step[-1])
+        share = len(apart) / len(looked)
+        lasting = len(empty) > 2 and (max(empty) == looked[-1][0] or len(empty) > 0.5 * len(looked))
         yield Finding(
-            "several_modes", "warning" if at_end or share > 0.5 else "note", None, (min(apart), max(apart)),
-            {"steps": len(apart), "share": share},
-            f"at {len(apart)} steps the particles form several clouds: the mean lies between them, where nobody is",
+            "several_modes", "warning" if lasting else "note", None, (min(apart), max(apart)),
+            {"steps": len(apart) * every, "share": share, "hollow": len(empty) * every},
+            f"at {len(apart) * every} steps the particles form several clouds"
+            + (f", at {len(empty) * every} of them the mean lies between them, where nobody is" if empty else ""),
             "report the heaviest mode instead of the mean until the readings have decided",
         )  # fmt: skip
+
+
+def _hollow(space: Space, states: Array, log_weights: Array) -> float:
+    """The chance of so little weight about the mean of a normal cloud."""
+    mean, cov = moments(space, states, log_weights)
+    try:
+        far = squared_distance(space.minus(states, mean), np.broadcast_to(cov, (len(states), *cov.shape)))
+    except np.linalg.LinAlgError:
+        return 1.0
+    weights = np.exp(log_weights)
+    n = 1 / float(weights @ weights)
+    inside = float(weights @ (far < chi2.ppf(_NEAR, cov.shape[-1])))
+    return float(binom.cdf(np.round(n * inside), np.round(n), _NEAR))
+
+
+def far(case: Case) -> Iterator[Finding]:
+    """Weights far off the data: the particle that a reading fits best explains it worse than its noise allows.
+
+    With normal noise a likelihood is ℓ = ℓ₀ − ½·χ²(m) for the true state, m numbers read, and larger for the best
+    particle of a cloud that is about it. ℓ₀ is the largest of the run: no less than the truth would be too strict.
+    """
+    run = case.run
+    inputs = [name for name in run.inputs if name.startswith("z.")]
+    for table in run.stages.values():
+        if not {"log_likelihoods", "states"} <= table.values.keys() or not inputs:
+            continue
+        best = np.nanmax(table.values["log_likelihoods"], axis=1)
+        row = np.searchsorted(run.step, table.step)
+        m = sum(np.isfinite(run.inputs[name][row]).sum(1) for name in inputs)
+        rows = np.isfinite(best) & (m > 0) & (table.step >= case.first)
+        if rows.sum() < 5:
+            continue
+        top = {count: float(best[rows & (m == count)].max()) for count in np.unique(m[rows])}
+        p = np.array([chi2.sf(2 * (top[k] - b), k) for k, b in zip(m[rows], best[rows], strict=True)])
+        bad = p < level("error", int(rows.sum()))
+        if bad.any():
+            of = table.step[rows][bad]
+            yield Finding(
+                "particles_far", "error" if bad.mean() > 0.05 else "warning", None, (int(of[0]), int(of[-1])),
+                {"steps": int(bad.sum()), "least_p": float(p.min())},
+                f"at {int(bad.sum())} steps no particle is where the readings are: even the best one explains "
+                "them worse than their noise allows",
+                "take more particles or a wider motion noise; then check the units and the order of the readings",
+            )  # fmt: skip

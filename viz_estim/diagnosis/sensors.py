@@ -10,14 +10,12 @@ from scipy.stats import binom, t
 
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.finding import Finding, judge, level
-from viz_estim.recording.layout import as_product
 from viz_estim.recording.reader import Run
-from viz_estim.scenarios.imu_health import GRAVITY, frozen_gyro, still_prefix
+from viz_estim.scenarios.imu_health import GRAVITY, frozen_accel, frozen_gyro, still_prefix
 
 _SLOWER = 3.0  # a pause of so many usual intervals is one in which readings are missing
 _AT_THE_END = 0.75  # of a smooth signal's extreme and next value: an arc sine has 0.71 at its extreme
 _RESTING = 0.05  # rad/s: more than that is no bias that was left over
-_HELD = 0.05  # the share of readings that repeat the one before, where they are held
 
 
 class Given(NamedTuple):
@@ -82,14 +80,17 @@ def frozen(run: Run) -> Iterator[Finding]:
     both = imu(run)
     if both is not None:
         flags = frozen_gyro(run.time[both.rows], both.rate, both.force, np.zeros(3))
-        for first, last in _runs(flags):
+        for first, last in runs(flags):
             yield _stuck(run, "gyro", both.rows[first], both.rows[last], {"level": both.rate[first : last + 1].mean(0)})
+        for first, last in runs(frozen_accel(run.time[both.rows], both.rate, both.force) & ~flags):
+            level_of = both.force[first : last + 1].mean(0)
+            yield _stuck(run, "accel", both.rows[first], both.rows[last], {"level": level_of})
     sensors = given(run)
     for name, (rows, values) in sensors.items():
-        if not _continuous(values):
+        if not continuous(values) or (both is not None and name in ("gyro", "accel")):
             continue
         same = (np.diff(values, axis=0) == 0).all(1)
-        for first, last in _runs(same):
+        for first, last in runs(same):
             n = last - first + 2
             elsewhere = max((same.sum() - (n - 1)) / len(same), 1 / len(same))
             p = len(same) * elsewhere ** (n - 1)
@@ -198,44 +199,6 @@ def _left_of(run: Run, one: Given, without: Sequence[tuple[int, int]]) -> Given:
     return Given(one.rows[fine], one.values[fine])
 
 
-def used_twice(run: Run) -> Iterator[Finding]:
-    """One reading taken in twice: by two updates of a step, or held and given again at the next tick."""
-    seen: dict[tuple[str, int], list[Array]] = {}
-    twice: dict[str, set[int]] = {}
-    for table in run.stages.values():
-        if "innovation.z" in table.values:
-            space = as_product(table.spaces["innovation"])
-            for i, name in enumerate(space.parts):
-                offered = table.values["innovation.offered"][:, i] > 0
-                z = table.values["innovation.z"][:, space.at[name]]
-                for row in np.flatnonzero(offered):
-                    known = seen.setdefault((name, int(table.step[row])), [])
-                    if any(np.array_equal(z[row], other) for other in known):
-                        twice.setdefault(name, set()).add(int(table.step[row]))
-                    known.append(z[row])
-    for name, steps in twice.items():
-        yield _twice(name, (min(steps), max(steps)), len(steps), "at one step two updates take in the same reading")
-    for name, (rows, values) in given(run).items():
-        if name in twice or not _continuous(values):
-            continue
-        same = (np.diff(values, axis=0) == 0).all(1)
-        short = np.zeros(len(same), bool)
-        for first, last in _runs(same):
-            short[first : last + 1] = (last - first) < len(same) / 10
-        if short.mean() > _HELD:
-            at = np.flatnonzero(short) + 1
-            steps_held = int(run.step[rows[at[0]]]), int(run.step[rows[at[-1]]])
-            yield _twice(name, steps_held, len(at), "a reading is held and given again until the next one comes")
-
-
-def _twice(name: str, steps: tuple[int, int], count: int, how: str) -> Finding:
-    return Finding(
-        "used_twice", "error", name, steps, {"times": count},
-        f"{how}: {count} readings of {name} count double, so that the covariance is too small",
-        f"take each reading of {name} in once: update only at ticks at which a new one came",
-    )  # fmt: skip
-
-
 def biased_at_rest(run: Run) -> Iterator[Finding]:
     """A gyro that reads a rate while it lies still: its mean over the prefix's first half, by a t-test.
 
@@ -269,7 +232,7 @@ def biased_at_rest(run: Run) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
+def runs(flags: np.ndarray) -> list[tuple[int, int]]:
     """The runs of True in flags (T,), as first and last index, both inclusive."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
     return [(int(first), int(end) - 1) for first, end in edges]
@@ -282,7 +245,7 @@ def _quantum(distinct: Array) -> float:
     return float(steps.min()) if len(steps) else 0.0
 
 
-def _continuous(values: Array) -> bool:
+def continuous(values: Array) -> bool:
     """Whether readings (M, n) are so fine that none is met twice by chance: their steps are no multiples of one."""
     for x in values.T:
         distinct = np.unique(x)

@@ -11,14 +11,14 @@ fault that the state soaks up (a constant lag while driving straight) is found b
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2, norm, t
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
-from viz_estim.diagnosis.evidence import Case, parameter
+from viz_estim.diagnosis.evidence import Case, jacobians, once, parameter, transitions
 from viz_estim.diagnosis.finding import Finding, judge
 from viz_estim.recording.tables import StageTable
 
@@ -47,6 +47,8 @@ def lags(case: Case) -> Iterator[Finding]:
         interval = float(np.median(np.diff(case.run.time)))
         if severity is None or fault.score**2 < _EXPLAINS * excess or abs(tau) < interval:
             continue  # less than a step is how the model takes its steps
+        if abs(tau) > 0.1 * (case.run.time[-1] - case.run.time[0]):
+            continue  # so long a lag is no matter of a rate
         late = "late" if tau > 0 else "early"
         yield Finding(
             "lag", severity, name.partition("/")[0], case.whole,
@@ -90,11 +92,7 @@ def _excess(case: Case) -> float:
 
 
 def _tested(case: Case, kind: str) -> list[Fault]:
-    found = getattr(case, "_faults", None)
-    if found is None:
-        found = faults(case)
-        object.__setattr__(case, "_faults", found)
-    return [fault for fault in found if fault.kind.startswith(kind)]
+    return [fault for fault in once(case, "_faults", faults) if fault.kind.startswith(kind)]
 
 
 def faults(case: Case) -> list[Fault]:
@@ -160,8 +158,10 @@ def _estimated(name: str, kind: str, A: Array, b: Array, misfit: float) -> Fault
     score = float(b.sum() / np.sqrt(A.sum() * misfit))
     used = int((A > 0).sum())
     rest = (b - size * A)[A > 0]
-    scatter = np.sqrt(np.square(rest).sum() * used / max(used - 1, 1))
-    p = max(2 * norm.sf(abs(score)), 2 * t.sf(abs(b.sum()) / max(scatter, 1e-300), max(used - 1, 1)))
+    variance = float(np.square(rest).sum() * used / max(used - 1, 1))
+    p = 2 * norm.sf(abs(score))
+    if variance > A.sum() * misfit * chi2.isf(0.01, max(used - 1, 1)) / max(used - 1, 1):
+        p = max(p, 2 * t.sf(abs(b.sum()) / np.sqrt(variance), max(used - 1, 1)))
     return Fault(name, kind, float(size), score, float(p))
 
 
@@ -188,7 +188,7 @@ class _Update:
         self.H, self.inverse = np.zeros((len(P), m, d)), np.zeros((len(P), m, m))
         ok = self.sound
         cross = get["innovation.cross_cov"][ok]
-        self.H[ok] = np.swapaxes(_solved(P[ok], cross), 1, 2)
+        self.H[ok] = jacobians(P[ok], cross)
         self.inverse[ok] = np.linalg.solve(S[ok], np.broadcast_to(np.eye(m), S[ok].shape))
         self.offered: np.ndarray = get["innovation.offered"] > 0
         whole = self.offered.all(1)
@@ -210,33 +210,3 @@ class _Update:
                 spans = np.maximum(time[back:] - time[:-back], 1e-9)[:, None]
                 rate[back:] = part.minus(predicted[back:, at], predicted[:-back, at]) / spans
             self.delta[:, axes, column[name, "lag"]] = -rate * self.offered[:, i, None]
-
-
-def _solved(P: Array, C: Array) -> Array:
-    """P⁻¹·C (M, d, m); by the pseudo-inverse where P is singular."""
-    if (np.linalg.cond(P) < 1e13).all():
-        return np.asarray(np.linalg.solve(P, C), float)
-    solved: Array = np.linalg.pinv(P, rcond=1e-12, hermitian=True) @ C
-    return solved
-
-
-def transitions(case: Case, table: StageTable) -> Array | None:
-    """F (M, d, d) of a prediction: as recorded, or by least squares over its sigma points."""
-    if "transition" in table.values and table.values["transition"].shape[1:] == case.run.cov.shape[1:]:
-        return table.values["transition"]
-    drawn, moved = table.values.get("drawn.points"), table.values.get("propagated.points")
-    if drawn is None or moved is None or np.isnan(drawn).any() or np.isnan(moved).any():
-        return None
-    space: Any = case.space
-    mean, _ = case.sequence.before(table)
-    d, extra = len(space.axes), drawn.shape[-1] - len(space.names)
-    x = space.minus(drawn[..., : len(space.names)], mean[:, None, :])
-    if extra:  # noise among the points
-        x = np.concatenate([x, drawn[..., len(space.names) :]], axis=-1)
-    y = space.minus(moved, table.mean[:, None, :])
-    # Scaled, since states of very unlike size would lose the small ones.
-    size = np.maximum(np.abs(x).max(1, keepdims=True), 1e-12)
-    x = x / size
-    xT = np.swapaxes(x, 1, 2)
-    fit = np.linalg.pinv(xT @ x, rcond=1e-10, hermitian=True) @ (xT @ y)
-    return np.swapaxes(fit / np.swapaxes(size, 1, 2), 1, 2)[:, :, :d]

@@ -15,8 +15,9 @@ import numpy as np
 from viz_estim.core.measurement import Sensor
 from viz_estim.core.run import Scenario
 from viz_estim.core.spaces import Euclidean, Product
-from viz_estim.scenarios import beacons, flawed_data, flawed_filters, imu, landmarks, plaza, quadrotor, scan
+from viz_estim.scenarios import beacons, diffdrive, flawed_data, flawed_filters, imu, landmarks, plaza, quadrotor, scan
 from viz_estim.scenarios.beacons import BeaconData
+from viz_estim.scenarios.diffdrive import DriveData
 from viz_estim.scenarios.imu_data import ImuData
 from viz_estim.scenarios.landmarks import LandmarksData
 from viz_estim.scenarios.plaza_data import PlazaData
@@ -218,6 +219,12 @@ def delay_of_50_ms(data: ImuData) -> Scenario:
 def one_index_off(data: QuadrotorData) -> Scenario:
     """The camera's pose k is taken for pose k + 1: an index counted from 1 in place of 0."""
     return flawed_data.shifted(quadrotor.quadrotor_ukf_pose(data), 1)
+
+
+@_flaw("lag", diffdrive)
+def gps_one_late(data: DriveData) -> Scenario:
+    """Each position is taken for that of the next one's moment: an index that is one off."""
+    return flawed_data.shifted(diffdrive.diffdrive_ekf(data), 1)
 
 
 @_flaw("angle_wrap", quadrotor)

@@ -53,24 +53,50 @@ def frozen_gyro(stamps: Array, gyro: Array, accel: Array, bias: Array) -> np.nda
     than the stuck rates account for.
     """
     frozen = np.zeros(len(stamps), bool)
+    quantum = np.array([_quantum(channel) for channel in gyro.T])
+    for first, end in flat_runs(stamps, gyro):
+        rate = gyro[first:end].mean(0) - bias
+        off_rest = bool((np.abs(rate) > 3 * quantum).any())
+        explained = _UNEXPLAINED[0 if off_rest else 1] + _BIAS_LEFT * (stamps[end - 1] - stamps[first])
+        if _missed_turn(stamps[first:end], rate, accel[first:end]) > explained:
+            frozen[first:end] = True
+    return frozen
+
+
+def flat_runs(stamps: Array, values: Array) -> list[tuple[int, int]]:
+    """Where all channels of values (T, c) stay within a count of one value for 0.3 s and more: first, and one past the
+    last sample of each run."""
     width = round(_SHORTEST_FREEZE / max(float(np.median(np.diff(stamps))), 1e-6)) | 1  # odd: the windows are centred
     if width < 3 or width >= len(stamps):
-        return frozen
-    quantum = np.array([_quantum(channel) for channel in gyro.T])
-    span = maximum_filter1d(gyro, width, axis=0) - minimum_filter1d(gyro, width, axis=0)
+        return []
+    quantum = np.array([_quantum(channel) for channel in values.T])
+    span = maximum_filter1d(values, width, axis=0) - minimum_filter1d(values, width, axis=0)
     centres = (span <= 2.01 * quantum).all(1)
     # The windows at the two ends would lean on samples mirrored in; the flat runs are the union of the flat windows.
     centres[: width // 2] = centres[-(width // 2) :] = False
     flat = maximum_filter1d(centres, width)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]])))
-    # Two flat runs may touch, where a stuck gyro comes to itself at rest: the jump between them parts them.
-    jumps = np.flatnonzero((np.abs(np.diff(gyro, axis=0)) > 2.01 * quantum).any(1)) + 1
-    bounds = [b for e in edges.reshape(-1, 2) for b in _parted(e[0], e[1], jumps)]
-    for first, end in bounds:
-        rate = gyro[first:end].mean(0) - bias
-        off_rest = bool((np.abs(rate) > 3 * quantum).any())
-        explained = _UNEXPLAINED[0 if off_rest else 1] + _BIAS_LEFT * (stamps[end - 1] - stamps[first])
-        if _missed_turn(stamps[first:end], rate, accel[first:end]) > explained:
+    # Two flat runs may touch, where a stuck sensor comes to itself at rest: the jump between them parts them.
+    jumps = np.flatnonzero((np.abs(np.diff(values, axis=0)) > 2.01 * quantum).any(1)) + 1
+    return [b for e in edges.reshape(-1, 2) for b in _parted(e[0], e[1], jumps)]
+
+
+def frozen_accel(stamps: Array, gyro: Array, accel: Array) -> np.ndarray:
+    """Which samples (T,) were taken while the accelerometer was stuck: flat in all channels while the gyro turns it.
+
+    gyro (T, 3) rad/s; accel (T, 3). What tells a stuck one from one at rest: the gyro's rates, but for their mean,
+    carry gravity by more than their noise adds up to.
+    """
+    frozen = np.zeros(len(stamps), bool)
+    for first, end in flat_runs(stamps, accel):
+        down = accel[first:end].mean(0)
+        down = down / max(float(np.linalg.norm(down)), 1e-9)
+        about = gyro[first : end - 1] - gyro[first : end - 1].mean(0)  # a unit or a bias that is wrong is no motion
+        steps = np.diff(stamps[first:end])[:, None] * np.cross(about, down)
+        carried = np.linalg.norm(np.cumsum(steps, axis=0), axis=1).max(initial=0.0)
+        noise = np.diff(gyro[first:end], axis=0).std(0).max() / np.sqrt(2)
+        walk = noise * (stamps[end - 1] - stamps[first]) / np.sqrt(end - first)  # what noise alone adds up to, 1σ
+        if carried > _UNEXPLAINED[0] + 5 * walk:
             frozen[first:end] = True
     return frozen
 

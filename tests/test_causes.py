@@ -1,0 +1,281 @@
+"""The first finding is the cause: broken data and broken filters beside the gallery, each told by the right words."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.kalman import linear, linear_sensor
+from viz_estim.core.quaternions import Array
+from viz_estim.core.run import Scenario, Tick, run
+from viz_estim.core.spaces import Euclidean, Product
+from viz_estim.diagnose import diagnose
+from viz_estim.diagnosis import covariance, evidence, repeats, stamps, tuning
+from viz_estim.diagnosis.finding import Finding
+from viz_estim.recording.memory import collect
+from viz_estim.recording.reader import Run
+from viz_estim.scenarios import beacons, diffdrive, flawed_data, imu, landmarks
+from viz_estim.scenarios.flawed_filters import with_process_noise
+from viz_estim.scenarios.imu_health import frozen_accel
+
+Change = Callable[[Scenario], Scenario]
+
+
+def drive(**params: Any) -> Scenario:
+    return diffdrive.diffdrive_ekf(drive_data(), **params)
+
+
+@functools.cache
+def drive_data() -> diffdrive.DriveData:
+    return diffdrive.diffdrive(None, np.random.default_rng(100), duration=16.0)
+
+
+def reads(change: Callable[[Array], Array]) -> Change:
+    return lambda s: flawed_data.fed(s, lambda k, z: {name: change(v) for name, v in z.items()})
+
+
+def steers(change: Callable[[Array], Array]) -> Change:
+    def changed(s: Scenario) -> Scenario:
+        ticks = [replace(t, control=None if t.control is None else change(t.control)) for t in s.ticks]
+        return replace(s, ticks=ticks)
+
+    return changed
+
+
+def starts(*delta: float) -> Change:
+    return lambda s: replace(
+        s, beliefs={0: replace(s.beliefs[0], mean=s.space.plus(s.beliefs[0].mean, np.array(delta)))}
+    )
+
+
+def holds(first: float, last: float) -> Change:
+    def changed(s: Scenario) -> Scenario:
+        at = {k: t.measurements["gps"] for k, t in enumerate(s.ticks) if t.measurements}
+        level = next(z for k, z in at.items() if s.ticks[k].time >= first)
+        stuck = {k for k in at if first <= s.ticks[k].time < last}
+        return flawed_data.fed(s, lambda k, z: {"gps": level} if k in stuck else z)
+
+    return changed
+
+
+def found(scenario: Scenario, params: dict[str, Any] | None = None) -> list[Finding]:
+    return diagnose(collect(scenario, run(scenario), params))
+
+
+CAUSES: dict[str, tuple[Change, str, str | None, str]] = {
+    "axes swapped": (reads(lambda z: z[[1, 0]]), "units_or_axes", "gps", "axes +y +x"),
+    "a sign": (reads(lambda z: z * [1, -1]), "units_or_axes", "gps", "axes +x −y"),
+    "feet": (reads(lambda z: z / 0.3048), "units_or_axes", "gps", "feet for m"),
+    "a scale": (reads(lambda z: 1.1 * z), "units_or_axes", "gps", "× what the truth would give"),
+    "an offset": (reads(lambda z: z + np.array([3.0, 0.0])), "biased_innovation", "gps", "readings of gps x are +"),
+    "half a second late": (lambda s: flawed_data.shifted(s, 5), "lag", "gps", "s late"),
+    "stuck": (holds(8.0, 12.0), "sensor_frozen", "gps", "sticks at one value for"),
+    "the other way round": (steers(lambda u: u * [1, -1]), "process_model", None, "heading is predicted to move by -"),
+    "degrees": (steers(lambda u: u * [1, 180 / np.pi]), "process_model", None, "degrees for radians"),
+    "a rate's bias": (steers(lambda u: u + np.array([0, 0.3])), "process_model", None, "misses a steady -0."),
+    "slow wheels": (steers(lambda u: u * [0.7, 1]), "process_model", None, "is predicted to move by 0."),
+    "starts backwards": (starts(0, 0, np.pi), "start", None, "heading"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_the_cause_is_the_first_finding_and_the_only_error(name: str) -> None:
+    change, code, sensor, words = CAUSES[name]
+    first, *others = found(change(drive()))
+    assert (first.code, first.sensor, first.severity) == (code, sensor, "error")
+    assert words in first.cause
+    assert not [finding for finding in others if finding.severity == "error"], others
+    assert all("mend " in f.remedy for f in others if f.code in ("overconfident", "coloured_innovation", "diverged"))
+
+
+def test_numbers_that_are_told_are_true() -> None:
+    lag = found(flawed_data.shifted(drive(), 5))[0]
+    assert lag.evidence["lag_s"] == pytest.approx(0.5, abs=0.06)
+    drift = found(steers(lambda u: u + np.array([0, 0.3]))(drive()))[0]
+    assert drift.evidence["drift"] == pytest.approx(-0.3, abs=0.03)
+    scale = found(reads(lambda z: 1.1 * z)(drive()))[0]
+    assert float(scale.evidence["map"].removeprefix("a factor of ")) == pytest.approx(1.1, abs=0.01)
+    bias = found(reads(lambda z: z + np.array([3.0, 0.0]))(drive()))[0]
+    assert bias.evidence["bias"] == pytest.approx(3.0, abs=0.4)
+    stuck = found(holds(8.0, 12.0)(drive()))[0]
+    assert stuck.evidence["from_s"] == pytest.approx(8.0, abs=0.11)
+    assert stuck.evidence["to_s"] == pytest.approx(12.0, abs=0.11)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 30])
+@pytest.mark.parametrize("truth", [True, False])
+def test_short_runs_and_runs_without_truth_are_healthy(steps: int, truth: bool) -> None:
+    scenario = drive()
+    scenario = replace(scenario, ticks=scenario.ticks[:steps], truth=scenario.truth if truth else None)
+    assert found(scenario) == []
+
+
+def test_a_truth_with_gaps_or_none_known_changes_nothing() -> None:
+    scenario = drive()
+    assert scenario.truth is not None
+    for rows in (slice(400, 900), slice(None)):
+        truth = scenario.truth.copy()
+        truth[rows] = np.nan
+        assert found(replace(scenario, truth=truth)) == []
+
+
+@pytest.mark.parametrize("factor", [1 / 9, 9.0])
+def test_the_factor_on_r_is_the_one_that_was_put_in(factor: float) -> None:
+    data = landmarks.landmarks(None, np.random.default_rng(100), duration=30.0)
+    noise = 0.3 * factor**0.5
+    told = found(landmarks.landmarks_ekf(data, range_noise=noise), {"range_noise": noise})[0]
+    assert (told.code, told.sensor) == ("overconfident" if factor < 1 else "underconfident", "range")
+    assert told.evidence["factor_on_R"] == pytest.approx(1 / factor, rel=0.3)
+    assert f"set range_noise to about {noise * told.evidence['factor_on_R'] ** 0.5:.2g}" in told.remedy
+
+
+@pytest.mark.parametrize(("factor", "code"), [(0.01, "overconfident"), (100.0, "underconfident")])
+def test_a_wrong_q_is_told_from_a_wrong_r(factor: float, code: str) -> None:
+    healthy = landmarks.landmarks_ekf(landmarks.landmarks(None, np.random.default_rng(100), duration=40.0))
+    scenario = replace(healthy, estimator=with_process_noise(healthy.estimator, factor), truth=None)  # type: ignore[arg-type]
+    told = found(scenario)[0]
+    assert told.code == code
+    assert np.log(told.evidence["factor_on_Q"] * factor) == pytest.approx(0, abs=np.log(2.5))
+    assert "multiply Q by about" in told.remedy
+
+
+def straight(r: float, q: float = 0.02, steps: int = 300) -> Scenario:
+    """A point that moves on a line, read with noise 1, by a filter that takes it for r."""
+    rng = np.random.default_rng(0)
+    F, Q = np.array([[1.0, 0.1], [0.0, 1.0]]), q * np.diag([0.0, 1.0])
+    x, readings = np.zeros(2), []
+    for _ in range(steps):
+        x = F @ x + [0.0, rng.normal(0, 0.02**0.5)]
+        readings.append(x[:1] + rng.standard_normal(1))
+    sensor = linear_sensor(Euclidean(("z",), "m"), np.eye(1, 2), r * np.eye(1))
+    space = Product(position=Euclidean(("x",), "m"), velocity=Euclidean(("v",), "m/s"))
+    ticks = [Tick(0.1 * k, 0.1 * (k > 0), measurements={"z": z}) for k, z in enumerate(readings)]
+    return Scenario(linear(F, Q, {"z": sensor}), {0: Gaussian(space, np.zeros(2), np.eye(2))}, ticks)
+
+
+def log_likelihood(recorded: Run) -> float:
+    table = recorded.stages["update"].values
+    S, v = table["innovation.cov"][:, 0, 0], table["innovation.residual"][:, 0]
+    near = v**2 / S < np.inf
+    return float(-0.5 * (v[near] ** 2 / S[near] + np.log(S[near])).sum())
+
+
+def test_tuning_says_what_a_rerun_would() -> None:
+    """Of a linear filter, to the digit: the gain in likelihood of its best factor is that of the filter run with it."""
+    scenario = straight(4.0)
+    recorded = collect(scenario, run(scenario))
+    best = tuning.factors(evidence.case(recorded))["z"]
+    again = straight(4.0 * best.factor)
+    gain = log_likelihood(collect(again, run(again))) - log_likelihood(recorded)
+    assert best.gain == pytest.approx(gain, rel=0.02)
+    assert best.factor == pytest.approx(0.25, rel=0.25)
+
+
+def test_particles_that_are_nowhere_near_the_readings_are_told() -> None:
+    scenario = beacons.beacons_pf(beacons.beacons(None, np.random.default_rng(100)))
+    first = found(reads(lambda z: z / 0.3048)(scenario))[0]
+    assert (first.code, first.severity) == ("particles_far", "error")
+
+
+def log(time: Array, dt: Array | None = None, **inputs: Array) -> Run:
+    """A recording of readings without any filter."""
+    dt = np.diff(time, prepend=time[0]) if dt is None else dt
+    n = len(time)
+    named = {name.replace("_", ".", 1): values for name, values in inputs.items()}
+    space = Product(x=Euclidean(("x",)))
+    ends = {"mean": np.zeros((n, 1)), "cov": np.ones((n, 1, 1))}
+    nothing = np.full((n, 1), np.nan)
+    return Run(None, {}, space, (), np.arange(n), time, dt, nothing, named, {}, ends, None, True)  # type: ignore[arg-type]
+
+
+def test_stamps_are_held_against_the_run_s_own() -> None:
+    rng = np.random.default_rng(1)
+    regular = 0.01 * np.arange(2000.0)
+    jittered = np.cumsum(rng.uniform(0.006, 0.014, 2000))
+    arrivals = regular + rng.uniform(0, 0.004, 2000)
+    poisson = np.cumsum(rng.exponential(0.01, 2000))
+    assert not [f for time in (regular, jittered, poisson) for f in stamps.stamps(log(time))]
+    assert [(f.evidence["kind"], f.severity) for f in stamps.stamps(log(arrivals))] == [("jitter", "note")]
+    for time in (regular, jittered):
+        lost = np.delete(time, np.arange(700, 730))
+        (gap,) = stamps.stamps(log(lost))
+        assert (gap.evidence["kind"], gap.steps) == ("gaps", (700, 700))
+    (wrong,) = stamps.stamps(log(jittered, dt=np.full(2000, 0.01)))
+    assert (wrong.evidence["kind"], wrong.severity) == ("dt", "error")
+
+
+def test_counts_at_rest_are_not_taken_for_readings_that_are_held() -> None:
+    rng = np.random.default_rng(2)
+    counts = np.round(rng.normal(500, 0.8, (900, 3))) / 34.3
+    fine = counts / np.linalg.norm(counts, axis=1, keepdims=True)  # no longer multiples of one step
+    time = 0.01 * np.arange(900)
+    assert list(repeats.used_twice(log(time, z_accel=fine))) == []
+    (twice,) = repeats.used_twice(log(time, z_accel=np.repeat(rng.normal(size=(300, 3)), 3, axis=0)))
+    assert twice.code == "used_twice"
+    doubled = np.repeat(rng.normal(size=(450, 3)), 2, axis=0)
+    (same,) = repeats.used_twice(log(np.repeat(0.01 * np.arange(450), 2), z_accel=doubled))
+    assert "samples are in the log twice" in same.cause
+
+
+def test_an_accelerometer_that_sticks_is_told_from_one_at_rest() -> None:
+    data = imu.imu(None, np.random.default_rng(100), duration=8.0, still=1.0, freeze=0.0)
+    assert not frozen_accel(data.time, data.gyro, data.accel).any()
+    begin, end = np.searchsorted(data.time - data.time[0], [4.0, 6.0])
+    stuck = data.accel.copy()
+    stuck[begin:end] = stuck[begin]
+    flags = np.flatnonzero(frozen_accel(data.time, data.gyro, stuck))
+    assert abs(flags[0] - begin) <= 3
+    assert abs(flags[-1] - (end - 1)) <= 3
+
+
+@functools.cache
+def walk() -> Run:
+    return collect(straight(1.0), run(straight(1.0)))
+
+
+def changed(change: Callable[[Array], Array], stage: str = "update") -> evidence.Case:
+    """The run with another covariance after a stage."""
+    recorded = walk()
+    table = recorded.stages[stage]
+    stages = recorded.stages | {stage: replace(table, values=table.values | {"cov": change(table.cov.copy())})}
+    return evidence.case(replace(recorded, stages=stages))
+
+
+def kinds(case: evidence.Case, check: Callable[[evidence.Case], Any]) -> list[tuple[str, str]]:
+    return [(f.evidence["kind"], f.severity) for f in check(case)]
+
+
+def test_a_covariance_is_held_to_rounding() -> None:
+    def skewed(by: float) -> Callable[[Array], Array]:
+        def change(P: Array) -> Array:
+            P[:, 0, 1] += by * np.sqrt(P[:, 0, 0] * P[:, 1, 1])
+            return P
+
+        return change
+
+    assert kinds(changed(lambda P: P), covariance.broken) == []
+    assert kinds(changed(skewed(1e-10)), covariance.broken) == [("rounding", "note")]
+    assert kinds(changed(skewed(1e-3)), covariance.broken) == [("asymmetric", "error")]
+    assert kinds(changed(lambda P: P - 2 * np.diag([0, 1]) * P), covariance.broken)[0] == ("negative", "error")
+    single = changed(lambda P: P.astype(np.float32).astype(float))
+    assert ("asymmetric", "error") not in kinds(single, covariance.broken)
+    assert kinds(changed(lambda P: P), covariance.claims) == []
+    assert kinds(changed(lambda P: 0.5 * P), covariance.claims) == [("claims", "error")]
+
+
+def test_a_covariance_that_shrinks_as_readings_allow_has_not_collapsed() -> None:
+    recorded, n = walk(), len(walk().step)
+    for shape, found_kinds in (
+        (1 / np.arange(1, n + 1), []),  # a constant, read again and again
+        (1 / np.arange(1.0, n + 1) ** 3, []),  # a rate
+        (np.exp(-np.arange(n) / 10), [("collapsed", "error")] * 2),
+        (1e-40 + 0 * np.arange(n), []),  # as it began
+        (np.arange(1.0, n + 1), [("growing", "note")] * 2),
+    ):
+        cov = shape[:, None, None] * np.eye(2)
+        ends = recorded.ends | {"cov": cov}
+        assert kinds(evidence.case(replace(recorded, ends=ends)), covariance.bounds) == found_kinds

@@ -1,0 +1,123 @@
+"""Does the filter know how wrong its state is? The size of errors (NEES) by part, where truth is known.
+
+Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and Navigation* (2001), section 5.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.stats import chi2
+
+from viz_estim.core.quaternions import Array
+from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.finding import Finding, judge
+
+_GROSS = 2.0  # errors as large as this multiple of their covariance's are an error
+_FEWEST = 10
+
+
+def start(case: Case) -> Iterator[Finding]:
+    """The error of the first belief against its covariance: eᵀ·P⁻¹·e is χ² of as many components as have a truth."""
+    run = case.run
+    if run.labels or run.properties.get("belief") == "Particles" or not {"mean", "cov"} <= run.ends.keys():
+        return
+    if any("rmse" in table.values for table in run.stages.values()):
+        return  # a registration starts where it is told to, and says so by no covariance
+    table = run.stages.get("start")
+    known_at = np.flatnonzero((run.step >= case.first) & np.isfinite(run.truth).any(1) & np.isfinite(run.mean).all(1))
+    if not len(known_at) or known_at[0] > run.row(step=case.whole[0]) + 0.05 * len(run.step):
+        return
+    k = int(known_at[0])
+    mean, P = run.mean[k], run.cov[k]
+    if table is not None and int(run.step[k]) in table.step.tolist():
+        mean, P = table.mean[-1], table.cov[-1]
+    error = case.space.minus(run.truth[k], mean)
+    known = np.isfinite(error) & (np.diag(P) > 0)
+    if not known.any() or np.linalg.cond(P[known][:, known]) > 1e13:
+        return
+    value, dof = float(error[known] @ np.linalg.solve(P[known][:, known], error[known])), int(known.sum())
+    severity = judge(float(chi2.sf(value, dof)), 1, large=True)
+    if severity:
+        sigma = np.where(known, np.abs(error) / np.sqrt(np.where(known, np.diag(P), 1.0)), 0.0)
+        worst = int(np.argmax(sigma))
+        name, unit, step = case.space.axes[worst], case.space.axis_units[worst], int(run.step[k])
+        yield Finding(
+            "start", severity, None, (step, step),
+            {"component": name, "error": float(error[worst]), "sigma": float(sigma[worst]), "nees": value, "dof": dof},
+            f"the filter starts {sigma[worst]:.2g}σ off the truth, most of all in {name} ({error[worst]:+.3g} {unit})",
+            f"start it nearer, or with a standard deviation of {name} of about {abs(error[worst]):.2g} {unit}",
+        )  # fmt: skip
+
+
+def by_part(case: Case) -> Iterator[Finding]:
+    """Mean NEES of each part of the state, where truth is known, against χ² of as many errors as are independent.
+
+    Errors are not white: of T there are T/τ independent ones, with τ = 1 + 2·Σρₖ² of the whitened errors'
+    autocorrelation about zero, up to its first ρₖ < 0.05 (Geyer 1992: an initial positive sequence). Twice that τ is
+    taken, for it is an estimate itself.
+    """
+    run = case.run
+    if run.labels or "mean" not in run.ends:
+        return
+    counts = run.step >= case.first
+    found = []
+    for name, part in case.space.parts.items():
+        at, axes = case.space.at[name], case.space.axes_at[name]
+        error = part.minus(run.mean[:, at], run.truth[:, at])
+        P = run.cov[:, axes, axes]
+        rows = counts & np.isfinite(error).all(1) & np.isfinite(P).all((1, 2))
+        rows[rows] &= np.linalg.eigvalsh(P[rows])[:, 0] > 1e-12 * np.trace(P[rows], axis1=1, axis2=2)
+        if rows.sum() >= _FEWEST:
+            white = np.linalg.solve(np.linalg.cholesky(P[rows]), error[rows][..., None])[..., 0]
+            found.append((name, run.step[rows], white))
+    for name, steps, white in found:
+        T, dof = white.shape
+        mean = float((white**2).sum() / T)
+        independent = max(1.0, T / (2 * _correlation_time(white)))
+        total = mean * independent
+        p = 2 * min(chi2.sf(total, dof * independent), chi2.cdf(total, dof * independent))
+        ratio = mean / dof
+        severity = judge(p, 2 * len(found), large=ratio > _GROSS**2)
+        if severity is None:
+            continue
+        evidence = {"part": name, "mean_nees": mean, "dof": dof, "independent": independent, "p": p}
+        code = "overconfident" if ratio > 1 else "underconfident"
+        what = f"the error of {name} is {ratio**0.5:.2g}× as large as its covariance says"
+        if ratio > 1:
+            why, remedy = _too_sure(case, name)
+            cause = f"{what}: {why}"
+        else:
+            cause, remedy = f"{what}: it is better known than the filter believes", f"lower the noise that moves {name}"
+        yield Finding(code, severity, None, (int(steps[0]), int(steps[-1])), evidence, cause, remedy)
+
+
+def _too_sure(case: Case, name: str) -> tuple[str, str]:
+    """Why a part's error may be larger than its covariance, and what to try, by the kind of estimator."""
+    if any("rmse" in table.values for table in case.run.stages.values()):
+        return (
+            "it takes each pair of points as right and its error as its own, while neighbours share them (Censi 2007)",
+            "do not weigh by this covariance; take the spread of registrations from several starts, or a fixed one",
+        )
+    if case.run.properties.get("belief") == "Particles":
+        return (
+            "the cloud is too narrow, or sits in a wrong place: too few particles, noises that are too small, or "
+            "readings and motion that do not belong together",
+            "take more particles and wider noises; then check units, signs and order of readings and control",
+        )
+    return (
+        f"{name} carries the inconsistency; its process or initial noise is too small, or it is biased",
+        f"raise the noise that moves {name}; look for a bias in the sensors that tell of it",
+    )
+
+
+def _correlation_time(white: Array) -> float:
+    """τ of the squares: 1 + 2·Σρₖ², with ρₖ about zero, since a whitened error's mean is known to be that."""
+    T = len(white)
+    spectrum = np.fft.rfft(white, 2 * T, axis=0)
+    rho = np.fft.irfft((np.abs(spectrum) ** 2).sum(1))[:T]
+    rho = rho / max(rho[0], 1e-300)
+    small = np.flatnonzero(rho < 0.05)
+    end = int(small[0]) if len(small) else T
+    return float(1 + 2 * (rho[1:end] ** 2).sum())

@@ -1,0 +1,155 @@
+"""Does the prediction move the state as the truth moves? Its sign, its unit, its scale and its drift, by component."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2, t
+
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import SO2, SO3, wrap
+from viz_estim.diagnosis.axes import maps
+from viz_estim.diagnosis.evidence import Case, transitions
+from viz_estim.diagnosis.finding import Finding, judge
+from viz_estim.diagnosis.truth import FEWEST, STRETCHES, SURELY, named
+from viz_estim.diagnosis.truth import slip as bound
+
+
+def prediction(case: Case) -> Iterator[Finding]:
+    """By component of the state: Δ = c·Δ' + b·dt, with Δ the truth's motion and Δ' the one that is predicted from it.
+
+    Δ' = Δ − w has no noise of the truth in it but what F carries, so that c is not pulled to zero. A sound prediction
+    has c = 1 and b = 0: t-tests, with a variance by 20 stretches of the run (Liang and Zeger 1986).
+    """
+    run = case.run
+    if run.labels:
+        return
+    moves = [(table, F) for table in run.stages.values() if (F := transitions(case, table)) is not None]
+    if not np.isfinite(run.truth).any() or len(moves) != 1:
+        return
+    (table, F), row = moves[0], {int(step): k for k, step in enumerate(run.step)}
+    before, _ = case.sequence.before(table)
+    at = np.array([row[int(step)] for step in table.step])
+    ok = (at > 0) & (table.step > case.first)
+    now, past = run.truth[at], run.truth[np.maximum(at - 1, 0)]
+    error, after = case.space.minus(past, before), case.space.minus(now, table.mean)
+    needed = np.asarray((np.abs(np.nan_to_num(F)) > 1e-12).any(0))
+    d = len(case.space.axes)
+    told_of: list[tuple[float, Finding]] = []
+    moving: dict[int, tuple[Array, Array, np.ndarray]] = {}
+    parts = [(name, i) for name, axes in case.space.axes_at.items() for i in range(axes.start, axes.stop)]
+    for name, i in parts:
+        known = np.asarray(np.isfinite(error[:, needed[i]]).all(1) & np.isfinite(after[:, i]) & ok)
+        known &= np.isfinite(F[:, i]).all(1)
+        if known.sum() < FEWEST:
+            continue
+        w = after[known, i] - np.einsum("td,td->t", F[known, i][:, needed[i]], error[known][:, needed[i]])
+        if isinstance(case.space.parts[name], SO2):
+            w = wrap(w)
+        motion = case.space.minus(now, past)[known, i]
+        told, dt = motion - w, run.dt[at[known]]
+        slip = bound(F[known][:, i : i + 1], np.nan_to_num(error[known]), before[known], case.space)
+        near = np.isfinite(slip) & (dt > 0)
+        if near.sum() >= FEWEST:
+            of = table.step[known][near]
+            moving[i] = told[near] + w[near], told[near], of
+            told_of += _moves_as(case, name, i, of, w[near], told[near], dt[near], slip[near], 2 * d)
+    for name, part in case.space.parts.items():
+        axes = range(case.space.axes_at[name].start, case.space.axes_at[name].stop)
+        if isinstance(part, SO3) and all(i in moving and len(moving[i][0]) == len(moving[axes[0]][0]) for i in axes):
+            truly, told = (np.stack([moving[i][k] for i in axes], axis=-1) for k in (0, 1))
+            if (found := _turns_as(name, truly, told, moving[axes[0]][2])) is not None:
+                yield found
+                return
+    if told_of:
+        # One cause shows in several components: the one that it explains best is told.
+        told_of.sort(key=lambda entry: (entry[1].severity != "error", -entry[0]))
+        also = [f.evidence for _, f in told_of[1:]]
+        yield replace(told_of[0][1], evidence=told_of[0][1].evidence | ({"also": also} if also else {}))
+
+
+def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray) -> Finding | None:
+    """The map of the rates' axes, or the unit, by which what is predicted (M, 3) is what happens (M, 3)."""
+    own = float(np.square(truly - told).sum())
+    best, what = min((float(np.square(truly - told @ A.T).sum()), title) for title, A in maps(3, "rad/s"))
+    gain, explained = 0.5 * truly.size * np.log(own / max(best, 1e-300)), 1 - best / max(own, 1e-300)
+    if explained < SURELY or judge(float(np.exp(-min(gain, 700.0))), 60, large=True) != "error":
+        return None
+    words = f"its rates as {what}" if what.startswith("axes") else f"a factor ({what})"
+    return Finding(
+        "process_model", "error", None, (int(of[0]), int(of[-1])),
+        {"component": name, "map": what, "explained": explained, "against": "truth"},
+        f"{name} is predicted to turn otherwise than it does: {words} would explain {explained:.0%} of the difference",
+        f"check the order, the signs and the unit of the control that turns {name}: the best map is `{what}`",
+    )  # fmt: skip
+
+
+def _moves_as(
+    case: Case, name: str, i: int, of: np.ndarray, w: Array, told: Array, dt: Array, slip: Array, tests: int
+) -> Iterator[tuple[float, Finding]]:
+    """w = (c − 1)·Δ' + b·dt: which of the two is off, if any. By rates, so that a long step counts like others.
+
+    Noise of the control pulls the slope of Δ on Δ' to zero, noise of the motion that of Δ' on Δ: the factor lies
+    between the two, and where 1 does too there is none.
+    """
+    w, told, slip = w / dt, told / dt, slip / dt
+    one, truly = np.ones_like(told), told + w
+    drift, p_drift, left_drift = _slope(w, one)
+    beta, p_factor, left_factor = _slope(w, told)
+    back, p_back, _ = _slope(-w, truly)
+    ends = 1 / (1 + beta) if beta != -1 else np.inf, 1 + back
+    by_factor = left_factor < left_drift
+    share = 1 - min(left_factor, left_drift) / max(float((w**2).sum()), 1e-300)
+    explains = abs(beta) * float(np.abs(told).mean()) if by_factor else abs(drift)
+    if explains < 2 * float(np.quantile(slip, 0.95)):
+        return
+    axis, unit = case.space.axes[i].rpartition(".")[2], case.space.axis_units[i]
+    label = name if axis in ("", name, "angle") else f"{name} {axis}"
+    steps = int(of[0]), int(of[-1])
+    if by_factor:
+        if (ends[0] - 1) * (ends[1] - 1) <= 0:
+            return
+        # Of what is predicted, against what happens: the end that has a name, or the more careful one.
+        known = [f for f in ends if named(f, unit) != named(1.3, unit)]
+        factor = known[0] if known else min(ends, key=lambda f: abs(f - 1))
+        p = max(p_factor, p_back)
+        severity = judge(p, tests, large=abs(factor - 1) > 0.05)
+        sign = (
+            "its sign is wrong"
+            if abs(factor + 1) < 0.2
+            else named(factor, unit)
+            if factor > 0
+            else "a wrong sign and size"
+        )
+        cause = f"{label} is predicted to move by {factor:.3g}× what it does: {sign}"
+        remedy = (
+            f"look at the control that moves {label}: its sign, its unit, its calibration (divide it by {factor:.3g})"
+        )
+        evidence: dict[str, object] = {"component": label, "factor": factor, "p": p}
+    else:
+        severity = judge(p_drift, tests, large=abs(drift) > 0.05 * float(np.abs(told).mean()))
+        cause = (
+            f"the prediction misses a steady {drift:+.3g} {unit}/s of {label}: the control that moves it has a bias, "
+            "or a force is missing from the model"
+        )
+        remedy = f"calibrate that bias ({drift:+.3g} {unit}/s), or add it to the state and let the filter estimate it"
+        evidence = {"component": label, "drift": drift, "p": p_drift}
+    if severity:
+        yield share, Finding("process_model", severity, None, steps, evidence | {"against": "truth"}, cause, remedy)
+
+
+def _slope(y: Array, x: Array) -> tuple[float, float, float]:
+    """The slope of y on x (M,) through zero, its p by a t-test, and Σ of the squares that are left."""
+    A = float(x @ x)
+    if A <= 0:
+        return 0.0, 1.0, float(y @ y)
+    slope = float(x @ y) / A
+    left = y - slope * x
+    pieces = np.array([part.sum() for part in np.array_split(x * left, min(STRETCHES, len(y) // 5))])
+    B = len(pieces)
+    scatter, model = float(pieces @ pieces) * B / (B - 1) / A**2, float(left @ left) / len(y) / A
+    if scatter < model * chi2.isf(0.01, B - 1) / (B - 1):
+        return slope, float(2 * t.sf(abs(slope) / np.sqrt(max(model, 1e-300)), len(y) - 1)), float(left @ left)
+    return slope, float(2 * t.sf(abs(slope) / np.sqrt(scatter), B - 1)), float(left @ left)

@@ -1,0 +1,67 @@
+"""Which finding is the cause, and which follow from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from scipy.stats import chi2
+
+from viz_estim.diagnosis.finding import SYMPTOMS, Finding, Severity
+
+
+def ranked(found: list[Finding]) -> list[Finding]:
+    """What follows from another finding is a warning at most, so that the cause comes first.
+
+    Symptoms follow from any cause; a cause follows from one of an earlier tier of the same sensor, or of none. What the
+    truth says of a sensor's bias or lag stands in place of what innovations make of it, but not where its Jacobian, by
+    which the truth is brought to it, is wrong.
+    """
+    wrong = {f.sensor for f in found if f.code == "jacobian"}
+    found = [f for f in found if not (f.evidence.get("against") == "truth" and f.sensor in wrong and f.sensor)]
+    seen = {(f.code, f.sensor) for f in found if f.evidence.get("against") == "truth"}
+    found = [f for f in found if f.evidence.get("against") == "truth" or (f.code, f.sensor) not in seen]
+    if not any(f.severity != "note" and (f.code in SYMPTOMS or f.code == "biased_innovation") for f in found):
+        found = [f for f in found if f.code != "process_model"]  # a filter that knows how wrong it is
+    if any(f.severity == "error" and f.code == "biased_innovation" and "bias" in f.evidence for f in found):
+        # Which sensor's bias explains the innovations is known: those of others lie off for it.
+        best = next(
+            f for f in found if f.code == "biased_innovation" and f.severity == "error" and "bias" in f.evidence
+        )
+        others = [f.code == "biased_innovation" and "bias" not in f.evidence for f in found]
+        found = [_softened(f, best) if other else f for f, other in zip(found, others, strict=True)]
+    found = [_of_the_noise(f, found) if f.code == "start" else f for f in found]
+    errors = [f for f in found if f.severity == "error" and f.code != "sensor_silent"]
+    return [_softened(f, next((c for c in errors if _follows(f, c)), None)) for f in found]
+
+
+def _of_the_noise(start: Finding, found: list[Finding]) -> Finding:
+    """A start that was made of readings is as far off as their R is too small: then that is the cause."""
+    for f in found:
+        factor, white = f.evidence.get("factor_on_R"), abs(f.evidence.get("autocorrelation", 1.0)) < 0.2
+        held = factor and chi2.sf(start.evidence["nees"] / factor, start.evidence["dof"]) > 0.01
+        if f.code == "overconfident" and white and held:
+            return _softened(start, f)
+    return start
+
+
+def _follows(finding: Finding, cause: Finding) -> bool:
+    if finding.code in SYMPTOMS and cause.code in SYMPTOMS:
+        # Errors of the state, from innovations of another size; and that these follow one another.
+        size = cause.code in ("overconfident", "outliers") and "part" not in cause.evidence
+        return size and ("part" in finding.evidence or finding.code == "coloured_innovation")
+    if finding.tier <= cause.tier:
+        return False
+    anywhere = finding.code in SYMPTOMS or cause.code == "sensor_frozen"
+    return anywhere or finding.sensor == cause.sensor or None in (finding.sensor, cause.sensor)
+
+
+def _softened(finding: Finding, cause: Finding | None) -> Finding:
+    """A warning at most, with what to mend before it, if it follows from another."""
+    if cause is None:
+        return finding
+    name = cause.code + (f" of {cause.sensor}" if cause.sensor else "")
+    remedy = (
+        finding.remedy if finding.remedy.startswith("mend ") else f"mend {name} first; if this stays: {finding.remedy}"
+    )
+    severity: Severity = "warning" if finding.severity == "error" else finding.severity
+    return replace(finding, severity=severity, remedy=remedy)

@@ -1,0 +1,63 @@
+"""Is one reading taken in as two?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.stats import binom
+
+from viz_estim.core.quaternions import Array
+from viz_estim.diagnosis.finding import Finding, judge
+from viz_estim.diagnosis.sensors import continuous, given, runs
+from viz_estim.recording.layout import as_product
+from viz_estim.recording.reader import Run
+
+_HELD = "a reading is held and given again until the next one comes"
+
+
+def used_twice(run: Run) -> Iterator[Finding]:
+    """One reading taken in twice: by two updates of a step, or held and given again at the next tick.
+
+    Equal neighbours may be chance where readings are counts. Then a reading is equal to the one before it as often as
+    to the one before that alone: of A and B such pairs A is binomial with 1/(2 − q), q the share of the first.
+    """
+    seen: dict[tuple[str, int], list[Array]] = {}
+    twice: dict[str, set[int]] = {}
+    for table in run.stages.values():
+        if "innovation.z" in table.values:
+            space = as_product(table.spaces["innovation"])
+            for i, name in enumerate(space.parts):
+                offered = table.values["innovation.offered"][:, i] > 0
+                z = table.values["innovation.z"][:, space.at[name]]
+                for row in np.flatnonzero(offered):
+                    known = seen.setdefault((name, int(table.step[row])), [])
+                    if any(np.array_equal(z[row], other) for other in known):
+                        twice.setdefault(name, set()).add(int(table.step[row]))
+                    known.append(z[row])
+    for name, steps in twice.items():
+        yield _twice(name, (min(steps), max(steps)), len(steps), "at one step two updates take in the same reading")
+    readings = given(run)
+    for name, (rows, values) in readings.items():
+        if name in twice or not continuous(values):
+            continue
+        same = (np.diff(values, axis=0) == 0).all(1)
+        short = np.zeros(len(same), bool)
+        for first, last in runs(same):
+            short[first : last + 1] = (last - first) < len(same) / 10
+        again = int(((values[2:] == values[:-2]).all(1) & ~same[1:]).sum())
+        held, q = int(short.sum()), float(short.mean())
+        if judge(float(binom.sf(held - 1, held + again, 1 / (2 - q))), len(readings), large=True) == "error":
+            at = np.flatnonzero(short) + 1
+            steps_held = int(run.step[rows[at[0]]]), int(run.step[rows[at[-1]]])
+            doubled = float((np.diff(run.time)[np.maximum(rows[at] - 1, 0)] == 0).mean()) > 0.5
+            how = "samples are in the log twice, with one stamp" if doubled else _HELD
+            yield _twice(name, steps_held, len(at), how)
+
+
+def _twice(name: str, steps: tuple[int, int], count: int, how: str) -> Finding:
+    return Finding(
+        "used_twice", "error", name, steps, {"times": count},
+        f"{how}: {count} readings of {name} count double, so that the covariance is too small",
+        f"take each reading of {name} in once: update only at ticks at which a new one came",
+    )  # fmt: skip

@@ -1,0 +1,170 @@
+"""Which factor on R or on Q would make the filter consistent: the same filter again, with other noises.
+
+A linear filter's innovations under other noises follow from the recorded ones: with d the difference of the two
+estimates, d' = F·d and ν_f = ν − H·d before an update, d⁺ = d + K_f·ν_f − K·ν after it, and P_f by the Riccati
+recursion from the recorded F, H, R and Q = P' − F·P·Fᵀ. The factor is that of the greatest likelihood of the
+innovations, −½·Σ(ν_fᵀ·S_f⁻¹·ν_f + log|S_f|) (Mehra 1970; Abbeel et al. 2005). For a linearised filter this is right
+as long as d is small. Nothing of the filter is run.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.stats import chi2
+
+from viz_estim.core.consistency import squared_distance
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import Product
+from viz_estim.diagnosis.evidence import Case, jacobians, once, transitions
+from viz_estim.recording.tables import StageTable
+
+_GRID = np.arange(-6.0, 6.5) * np.log(10) / 2  # log factors, 10⁻³ to 10³
+_PLACES = 4000  # stages at most, from the first that counts on: of a thousand readings a factor is known to 5 %
+
+
+class Tuned(NamedTuple):
+    """The factor on a noise that explains the innovations best, and its gain in log-likelihood against 1."""
+
+    factor: float
+    gain: float
+
+    @property
+    def known(self) -> bool:
+        """Whether it is a number, and not the end of those that were tried."""
+        return abs(np.log(self.factor)) < 0.95 * _GRID[-1]
+
+
+def factors(case: Case) -> dict[str, Tuned]:
+    """By what is tuned: a sensor's name for its R, `Q` for the process noise. Empty where F or H is not known."""
+    return once(case, "_tuned", _factors)
+
+
+def _factors(case: Case) -> dict[str, Tuned]:
+    run = case.run
+    if run.labels or "cov" not in run.ends:
+        return {}
+    moves = {name: F for name, table in run.stages.items() if (F := transitions(case, table)) is not None}
+    updates = {
+        name: table
+        for name, table in run.stages.items()
+        if {"innovation.cross_cov", "innovation.noise", "gain"} <= table.values.keys()
+    }
+    if any(name.startswith("predict") and name not in moves for name in run.stages) or not updates:
+        return {}
+    names = list(dict.fromkeys(n.partition("/")[0] for t in updates.values() for n in _parts(t)))
+    if not all(np.nan_to_num(t.values["innovation.noise"]).any() for t in updates.values()):
+        return {}
+    kinds = [*names, "Q"] if moves else names
+    B = len(kinds) * len(_GRID)
+    scale = {kind: np.ones(B) for kind in kinds}
+    for i, kind in enumerate(kinds):
+        scale[kind][i * len(_GRID) : (i + 1) * len(_GRID)] = np.exp(_GRID)
+    scores = _scores(case, moves, updates, scale, B)
+    if scores is None:
+        return {}
+    found = {}
+    for i, kind in enumerate(kinds):
+        of = scores[i * len(_GRID) : (i + 1) * len(_GRID)]
+        at, best = _peak(of)
+        found[kind] = Tuned(float(np.exp(at)), float(best - of[len(_GRID) // 2]))
+    return found
+
+
+def _parts(table: StageTable) -> dict[str, slice]:
+    space = table.spaces["innovation"]
+    assert isinstance(space, Product)
+    return space.axes_at
+
+
+def _peak(scores: Array) -> tuple[float, float]:
+    """Where a cubic spline through the scores of the grid has its top, and how high that is."""
+    fine = np.linspace(_GRID[0], _GRID[-1], 40 * (len(_GRID) - 1) + 1)
+    values = CubicSpline(_GRID, np.nan_to_num(scores, nan=-1e300, neginf=-1e300))(fine)
+    k = int(np.argmax(values))
+    return float(fine[k]), float(values[k])
+
+
+def _scores(
+    case: Case, moves: dict[str, Array], updates: dict[str, StageTable], scale: dict[str, Array], B: int
+) -> Array | None:
+    """The log-likelihood (B,) of the innovations under each pair of factors."""
+    run, space = case.run, case.space
+    before = {name: case.sequence.before(run.stages[name])[1] for name in (*moves, *updates)}
+    H = {name: jacobians(before[name], table.values["innovation.cross_cov"]) for name, table in updates.items()}
+    noise = {name: _noise(run.stages[name], F, before[name]) for name, F in moves.items()}
+    first = next((k for k, s in enumerate(case.sequence.stage) if s and s[0].step[s[1]] >= case.first), 0)
+    carried = {name: _carried(case, table) for name, table in updates.items()}
+    d, score = len(space.axes), np.zeros(B)
+    x, P = np.zeros((B, d)), None
+    known = {name: {int(s) for s in readings.step} for name, readings in case.sensors.items()}
+    skipped = _outlying(case, updates)
+    for stage in case.sequence.stage[first : first + _PLACES]:
+        if stage is None:
+            continue
+        table, row = stage
+        name = table.name
+        if name in moves and P is not None:
+            F = moves[name][row]
+            x, P = x @ F.T, F @ P @ F.T + scale["Q"][:, None, None] * noise[name][row]
+        elif name in updates and P is not None:
+            get = table.values
+            h, nu, K = H[name][row], get["innovation.residual"][row], get["gain"][row]
+            R = np.repeat(get["innovation.noise"][row][None], B, axis=0)
+            on = np.ones(len(nu), bool)
+            for (part, axes), offered, used in zip(
+                _parts(table).items(), get["innovation.offered"][row], get["innovation.used"][row], strict=True
+            ):
+                sensor = part.partition("/")[0]
+                R[:, axes, axes] *= scale[sensor][:, None, None]
+                on[axes] = bool(offered and used and int(table.step[row]) in known.get(sensor, ()))
+            if not on.any() or not np.isfinite(h).all() or not np.isfinite(nu).all():
+                x = x - K @ np.nan_to_num(nu) if np.isfinite(K).all() else x
+                continue
+            h, v, S = h[on], nu[on] - x @ h[on].T, h[on] @ P @ h[on].T + R[:, on][:, :, on]
+            S = 0.5 * (S + np.swapaxes(S, 1, 2))
+            inverse, C = np.linalg.inv(S), P @ h[on].T
+            gain = C @ inverse
+            if (name, row) not in skipped:
+                score -= 0.5 * (np.einsum("bi,bij,bj->b", v, inverse, v) + np.linalg.slogdet(S)[1])
+            x = x + np.einsum("bdm,bm->bd", gain, v) - K @ nu
+            P = P - gain @ np.swapaxes(C, 1, 2)
+            if not space.flat:
+                T = carried[name][row]
+                x, P = x @ T.T, T @ P @ T.T
+            P = 0.5 * (P + np.swapaxes(P, 1, 2))
+        elif np.isfinite(table.cov[row]).all():
+            x, P = np.zeros((B, d)), np.repeat(table.cov[row][None], B, axis=0)
+    return score if P is not None and np.isfinite(score).any() else None
+
+
+def _carried(case: Case, table: StageTable) -> Array:
+    """The matrices (M, d, d) that carry changes before an update to those at the mean after it."""
+    mean, _ = case.sequence.before(table)
+    return case.space.transport(mean, case.space.minus(table.mean, mean))
+
+
+def _noise(table: StageTable, F: Array, before: Array) -> Array:
+    """Q (M, d, d) as the filter had it: recorded, or P' − F·P·Fᵀ without what rounding makes negative."""
+    if "noise" in table.values and table.values["noise"].shape == table.cov.shape:
+        return table.values["noise"]
+    Q = table.cov - F @ before @ np.swapaxes(F, 1, 2)
+    Q = np.nan_to_num(0.5 * (Q + np.swapaxes(Q, 1, 2)))
+    values, vectors = np.linalg.eigh(Q)
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2))
+
+
+def _outlying(case: Case, updates: dict[str, StageTable]) -> set[tuple[str, int]]:
+    """The updates, by stage and row, with a reading beyond χ²'s quantile of 1 − 10⁻³, as long as these are few: a
+    matter of outliers, not of a noise."""
+    found: set[tuple[str, int]] = set()
+    for name, table in updates.items():
+        get = table.values
+        for axes in _parts(table).values():
+            nis = squared_distance(get["innovation.residual"][:, axes], get["innovation.cov"][:, axes, axes])
+            far = nis > chi2.isf(1e-3, axes.stop - axes.start)
+            if far.mean() <= 0.05:
+                found |= {(name, int(row)) for row in np.flatnonzero(far)}
+    return found
