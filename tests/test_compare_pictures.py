@@ -7,10 +7,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 from conftest import SHORTEST, Cli
-from test_pictures import emptiness, picture
+from panels import assert_all_drawn
 
 import viz_estim
 from viz_estim.recording.viewer import Viewer
@@ -28,7 +27,7 @@ KINDS: dict[str, list[list[str]]] = {
     "clouds": [_CLOUD, [*_CLOUD, "--set=range_noise=2"]],
 }
 AT = {"attitudes": 2.5, "six robots": 2.0, "three bars": 30.0, "clouds": 2.0}
-SIZE, HEAD, FOOT = (1100, 800), 37, 28  # a window, and what the viewer takes of it above and below the views
+SIZE = (1100, 800)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +44,8 @@ def test_every_view_of_a_comparison_draws_and_none_is_empty(
     for arguments, file in zip(KINDS[kind], files, strict=True):
         assert cli("run", *arguments, "--out", file).code == 0
     assert cli("compare", *files, "--out", tmp_path / "all.rrd").code == 1
-    assert_all_drawn(viewer, tmp_path / "all.rrd", AT[kind])
+    viewer.open(tmp_path / "all.rrd")
+    assert_all_drawn(viewer, SIZE, "time", AT[kind], tmp_path / "all.png")
     assert len(links(viewer)) == len(files) - 1
     viewer._client.open(links(viewer)[0])
 
@@ -54,7 +54,8 @@ def test_every_view_of_a_diagnosis_draws_and_its_links_jump(
     viewer: Viewer, cli: Cli, recording: Path, tmp_path: Path
 ) -> None:
     findings = json.loads(cli("diagnose", recording, "--out", tmp_path / "marked.rrd", "--json").out)["findings"]
-    assert_all_drawn(viewer, tmp_path / "marked.rrd", 3.0)
+    viewer.open(tmp_path / "marked.rrd")
+    assert_all_drawn(viewer, SIZE, "time", 3.0, tmp_path / "marked.png")
     run = viz_estim.load(recording)
     for url, finding in list(zip(links(viewer), findings, strict=True))[:3]:
         assert url.startswith("rerun+http://127.0.0.1:")
@@ -76,36 +77,3 @@ def cursor(viewer: Viewer) -> tuple[str, int]:
     state = viewer._client.get_state()
     (front,) = [recording for recording in state.recordings if recording.store_id == state.active_recording]
     return front.current_timeline, front.current_time
-
-
-def assert_all_drawn(viewer: Viewer, path: Path, at: float) -> None:
-    """At a time, all views of all tabs draw without a complaint, and show something."""
-    viewer.open(path)
-    cells = side_by_side(viewer)
-    viewer.seek("time", at)
-    assert viewer.snapshot(path.with_suffix(".png"), settle=30)
-    assert viewer.problems() == []
-    assert len(viewer.views()) == len(cells)
-    pixels = picture(viewer)
-    lacks = {name: emptiness(kind, pixels[rows, columns]) for name, kind, rows, columns in cells}
-    assert not any(lacks.values()), {name: lack for name, lack in lacks.items() if lack}
-
-
-def side_by_side(viewer: Viewer) -> list[tuple[str, str, slice, slice]]:
-    """Puts all views of all tabs into one grid; each one's name and class, and the pixels that it has for itself."""
-    blueprint = viewer._client.get_blueprint().blueprint
-    views = [path.lstrip("/") for path, fields in blueprint.items() if "ViewBlueprint" in fields]
-    across = int(np.ceil(np.sqrt(len(views))))
-    down = -(-len(views) // across)
-    root = blueprint["/viewport"]["ViewportBlueprint"]["root_container"]
-    kept = {path: fields for path, fields in blueprint.items() if not path.startswith("/container/")}
-    grid = {"container_kind": "Grid", "contents": views, "grid_columns": across}
-    viewer._client.set_blueprint(kept | {f"/container/{root}": {"ContainerBlueprint": grid}}, of="recording")
-    width, height = SIZE[0] / across, (SIZE[1] - HEAD - FOOT) / down
-    cells = []
-    for i, path in enumerate(views):
-        view = blueprint[f"/{path}"]["ViewBlueprint"]
-        x, y = i % across * width, HEAD + i // across * height
-        rows, columns = slice(int(y) + 28, int(y + height) - 2), slice(int(x) + 2, int(x + width) - 2)
-        cells.append((view["display_name"], view["class_identifier"], rows, columns))
-    return cells

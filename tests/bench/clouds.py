@@ -1,7 +1,7 @@
 """The particle filter and ICP against plain numpy and FilterPy: `python tests/bench/clouds.py` prints a table.
 
-Needs `pip install -e .[bench]`. Beside `particles` too, where that is installed: its 0.4 asks for numpy below 2, and runs
-with 2 (`pip install numba joblib scikit-learn && pip install --no-deps particles==0.4`).
+Needs `pip install -e .[bench]`. Beside `particles` too, where that is installed: its 0.4 asks for numpy below 2 and
+runs with 2 (`pip install numba joblib scikit-learn && pip install --no-deps particles==0.4`).
 """
 
 from __future__ import annotations

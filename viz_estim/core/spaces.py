@@ -293,9 +293,8 @@ class Product:
 
 
 def wrap(angle: Array) -> Array:
-    """The same angles in [−π, π)."""
+    """The same angles in [−π, π). Where many are, that they are takes a tenth of the division to see."""
     turned = angle + np.pi
-    # Most are within already: to see that takes a tenth of a division, and pays for many of them.
     if np.size(turned) > 100 and turned.min() >= 0 and turned.max() < 2 * np.pi:
         return turned - np.pi
     return turned % (2 * np.pi) - np.pi
