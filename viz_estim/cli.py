@@ -24,7 +24,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         arguments = _parser().parse_args(argv)
         command: Callable[[argparse.Namespace], int | None] = arguments.command
-        with np.errstate(over="ignore"):  # what overflows is infinite, and the run ends where that is seen
+        with np.errstate(over="ignore", invalid="ignore"):  # the run ends at the step where that is seen
             return command(arguments) or 0
     except _Usage as error:
         return _refuse(str(error))

@@ -42,4 +42,5 @@ def by_second(stamps: list[Array]) -> np.ndarray:
 
 
 def typical(residual: Array) -> float:
+    """The size of a residual as its median has it: σ of a normal one, whatever its tails are."""
     return float(1.4826 * np.median(np.abs(residual)))
