@@ -229,7 +229,8 @@ COMMANDS = [
     "names", "where", "why", "set {p}={y}", "set q={y} r={y}", "set", "branches", "switch {n}", "compare",
     "compare {n}", "help", "help st", "", "bogus", "set data.q=1", "set q", "set 'q", "break", "save", "save x.txt",
     "goto", "goto -3", "step -1", "\x00", "print", "sw", "?", "step 1 2", "back 99", "step 99", "stage 9999",
-    "delete", "switch", "b", "c", "p mean",
+    "delete", "switch", "b", "c", "p mean", "break finding", "break finding and step > {k}", "print finding",
+    "save a.rrd",
 ]  # fmt: skip
 
 
