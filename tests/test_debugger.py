@@ -447,6 +447,21 @@ def test_a_slip_is_one_line(walk: str, line: str, words: str) -> None:
     assert words in told
 
 
+def test_two_sessions_at_once_record_into_files_of_their_own(walk: str) -> None:
+    sessions = [Told(live_branch(walk)) for _ in range(2)]
+    for session in sessions:
+        session.do("step 20", "set r=2", "step 5")
+    for session in sessions:
+        session.do("step 3")
+    paths = [branch.file.path for session in sessions for branch in session.branches if branch.file]
+    assert len({*paths}) == 4
+    for session in sessions:
+        for branch in session.branches:
+            assert branch.file
+            branch.file.close()
+            assert len(viz_estim.load(branch.file.path).step) == branch.source.reached + 1
+
+
 def test_a_file_that_was_cut_has_whole_steps_alone(recording: Path, tmp_path: Path) -> None:
     data, opened = recording.read_bytes(), 0
     for offset in np.random.default_rng(3).integers(1000, len(data), 6):
