@@ -135,7 +135,7 @@ REFUSED = {
     "": "no expression",
     "1 +": "no expression",
     "__import__('os')": "no function __import__",
-    "mean.__class__": "no mean.__class__",
+    "mean.__class__": "no quantity's name begins with _",
     "(1).real": "only quantities have parts",
     "mean[0].T": "only quantities have parts",
     "cov[step]": "an index is a whole number",
