@@ -229,7 +229,8 @@ COMMANDS = [
     "names", "where", "why", "set {p}={y}", "set q={y} r={y}", "set", "branches", "switch {n}", "compare",
     "compare {n}", "help", "help st", "", "bogus", "set data.q=1", "set q", "set 'q", "break", "save", "save x.txt",
     "goto", "goto -3", "step -1", "\x00", "print", "sw", "?", "step 1 2", "back 99", "step 99", "stage 9999",
-    "delete", "switch", "b", "c", "p mean",
+    "delete", "switch", "b", "c", "p mean", "break finding", "break finding and step > {k}", "print finding",
+    "save a.rrd",
 ]  # fmt: skip
 
 
@@ -444,6 +445,21 @@ def test_a_slip_is_one_line(walk: str, line: str, words: str) -> None:
     (told,) = session.do(line)
     assert told.startswith("error: ")
     assert words in told
+
+
+def test_two_sessions_at_once_record_into_files_of_their_own(walk: str) -> None:
+    sessions = [Told(live_branch(walk)) for _ in range(2)]
+    for session in sessions:
+        session.do("step 20", "set r=2", "step 5")
+    for session in sessions:
+        session.do("step 3")
+    paths = [branch.file.path for session in sessions for branch in session.branches if branch.file]
+    assert len({*paths}) == 4
+    for session in sessions:
+        for branch in session.branches:
+            assert branch.file
+            branch.file.close()
+            assert len(viz_estim.load(branch.file.path).step) == branch.source.reached + 1
 
 
 def test_a_file_that_was_cut_has_whole_steps_alone(recording: Path, tmp_path: Path) -> None:

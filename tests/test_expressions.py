@@ -135,7 +135,7 @@ REFUSED = {
     "": "no expression",
     "1 +": "no expression",
     "__import__('os')": "no function __import__",
-    "mean.__class__": "no mean.__class__",
+    "mean.__class__": "no quantity's name begins with _",
     "(1).real": "only quantities have parts",
     "mean[0].T": "only quantities have parts",
     "cov[step]": "an index is a whole number",
@@ -219,3 +219,12 @@ def test_a_covariance_that_is_not_finite_has_no_eigenvalues() -> None:
     f.values["cov"][3, 0, 0] = np.nan
     found = value("min(eig(cov))", f)
     assert np.isnan(found).tolist() == [i == 3 for i in range(7)]
+
+
+def test_one_of_several_targets_may_be_written_as_it_is_named() -> None:
+    found = frame()
+    for text, as_text in (("innovation.range/1", 'innovation["range/1"]'), ("mean.rate/1", "mean.rate")):
+        one, other = (expressions.evaluate(expressions.parse(t), found.lookup) for t in (text, as_text))
+        np.testing.assert_array_equal(one, other)
+    halved, whole = (expressions.evaluate(expressions.parse(t), found.lookup) for t in ("mean.rate/2", "mean.rate"))
+    np.testing.assert_array_equal(halved, whole / 2)

@@ -121,7 +121,10 @@ def of_parts(number: int, about: str, parts: list[Part], source: Live, screen: S
     """A branch that runs, and is recorded in `recordings/` as it does."""
     last = parts[-1]
     title = f"{last.plan.title()}-debug{'' if number == 1 else f'-{number}'}"
-    file = File(Path("recordings") / f"{title}.rrd", parts, screen, source)
+    path, again = Path("recordings") / f"{title}.rrd", 1
+    while partial_of(path).exists():  # of another session: it goes on, or was killed
+        path, again = path.with_name(f"{title}_{again + 1}.rrd"), again + 1
+    file = File(path, parts, screen, source)
     for step in source.steps():
         file.add(step)
     source.told = file.add

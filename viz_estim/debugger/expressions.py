@@ -11,6 +11,7 @@ import ast
 import operator
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,14 @@ def name_of(node: ast.expr) -> str | None:
     if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant) and isinstance(node.slice.value, str):
         head = name_of(node.value)
         return head and f"{head}.{node.slice.value}"
+    return None
+
+
+def _target(node: ast.BinOp) -> str | None:
+    """The name that looks like a division: `nis.range/1` is that of the first of several targets, if there is one."""
+    head = name_of(node.left) if isinstance(node.op, ast.Div) else None
+    if head and isinstance(node.right, ast.Constant) and type(node.right.value) is int:
+        return f"{head}/{node.right.value}"
     return None
 
 
@@ -166,6 +175,9 @@ def _value(node: ast.expr, lookup: Lookup) -> Array:
     if isinstance(node, ast.UnaryOp):
         return _UNARY[type(node.op)](_numbers(_value(node.operand, lookup), node))
     if isinstance(node, ast.BinOp):
+        if (target := _target(node)) is not None:
+            with suppress(Absent):
+                return lookup(target)
         a, b = (_numbers(_value(side, lookup), side) for side in (node.left, node.right))
         return _product(a, b) if isinstance(node.op, ast.MatMult) else _BINARY[type(node.op)](*aligned(a, b))
     if isinstance(node, ast.BoolOp):

@@ -12,10 +12,10 @@ from viz_estim.recording.memory import collect
 from viz_estim.recording.reader import Run
 
 HOW = (
-    "of a run that goes on, findings are looked for after 50 steps, after half as many again, and so on, and at its "
-    "end; it stops at the step where one begins, once the evidence is in"
+    "of a run that goes on, findings are looked for after 50 steps, after twice as many, and so on, and at its end; it "
+    "stops at the step where one begins, once the evidence is in"
 )
-_FIRST, _GROWTH = 50, 1.5  # so that all looks together cost three times the last
+_FIRST, _GROWTH = 50, 2  # so that all looks together cost twice what the last does
 _MOST = 1 << 30  # bytes of beliefs that are kept for it
 _OF_THE_END = {"icp_not_converged"}  # what says how a run ended means nothing before
 
@@ -57,8 +57,8 @@ class Findings:
 
     def due(self, *, over: bool = False) -> bool:
         """Whether there is enough new to look at."""
-        count = len(self._steps)
-        enough = count >= max(_FIRST, _GROWTH * self._looked)
+        count, left = len(self._steps), len(self._scenario.ticks) - len(self._steps)
+        enough = count >= max(_FIRST, _GROWTH * self._looked) and left > count / 4  # else the end is near
         return not self.given_up and (enough or (over and count > self._looked))
 
     def look(self, missing: Callable[[int], Step], reached: int, *, over: bool) -> list[Finding]:

@@ -137,7 +137,9 @@ def load(path: str | Path, *, points: bool = True) -> Run:
             error = _texts(chunk.to_record_batch()).get("TextLog:text")
         elif entity.startswith("/stages/"):
             stages.setdefault(entity.removeprefix("/stages/"), Gathered(points)).add(chunk.to_record_batch())
-    if not properties.keys() & {"space", "labels"} or not steps.times:
+    if properties.keys() & {"space", "labels"} and not steps.times:
+        raise NotARun(f"{path}: the run was cut off before its first steps were written")
+    if not properties.keys() & {"space", "labels"}:
         raise NotARun(f"{path}: holds no run of viz_estim (make one with `viz-estim run`)")
     facts = {name: json.loads(text) for name, text in properties.items()}
     space = rebuild(facts["space"]) if "space" in facts else as_product(None)
