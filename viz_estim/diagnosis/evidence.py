@@ -209,6 +209,10 @@ def jacobians(P: Array, C: Array) -> Array:
 
 def transitions(case: Case, table: StageTable) -> Array | None:
     """F (M, d, d) of a prediction: as recorded, or by least squares over its sigma points."""
+    return once(case, f"_transitions of {table.name}", lambda case: _transitions(case, table))
+
+
+def _transitions(case: Case, table: StageTable) -> Array | None:
     if "transition" in table.values and table.values["transition"].shape[1:] == case.run.cov.shape[1:]:
         return table.values["transition"]
     drawn, moved = table.values.get("drawn.points"), table.values.get("propagated.points")
