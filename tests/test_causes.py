@@ -3,11 +3,13 @@
 import functools
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import viz_estim
 from viz_estim.core.beliefs import Gaussian
 from viz_estim.core.kalman import linear, linear_sensor
 from viz_estim.core.quaternions import Array
@@ -141,6 +143,28 @@ def test_a_wrong_q_is_told_from_a_wrong_r(factor: float, code: str) -> None:
     assert told.code == code
     assert np.log(told.evidence["factor_on_Q"] * factor) == pytest.approx(0, abs=np.log(2.5))
     assert "multiply Q by about" in told.remedy
+
+
+@pytest.mark.parametrize("told_of", [(), ("gain",), ("gain", "z", "noise")])
+@pytest.mark.parametrize("r", [1.0, 1 / 9])
+def test_a_recording_is_judged_by_what_it_tells(told_of: tuple[str, ...], r: float, tmp_path: Path) -> None:
+    """A person's own loop that leaves out readings, noise and gain: no finding is made of what is not there."""
+    recorded, path = collect(straight(r), run(straight(r))), tmp_path / "mine.rrd"
+    predict, update = recorded.stages["predict"], recorded.stages["update"]
+    names = {"gain": "gain", "z": "innovation.z", "noise": "innovation.noise"}
+    with viz_estim.record(path, {"x": "m", "v": "m/s"}) as recording:
+        for k in range(200):
+            recording.stage("moved", mean=predict.mean[k], cov=predict.cov[k])
+            told = {name: update.values[names[name]][k + 1] for name in told_of}
+            residual, S = (update.values[f"innovation.{name}"][k + 1] for name in ("residual", "cov"))
+            recording.stage(
+                "read", mean=update.mean[k + 1], cov=update.cov[k + 1], residual=residual, residual_cov=S, **told
+            )
+            recording.step(time=0.1 * k)
+    findings = diagnose(viz_estim.load(path))
+    assert [(f.code, f.severity) for f in findings] == ([] if r == 1 else [("overconfident", "error")])
+    if r != 1 and "noise" in told_of:
+        assert findings[0].evidence["factor_on_R"] == pytest.approx(9, rel=0.35)
 
 
 def straight(r: float, q: float = 0.02, steps: int = 300) -> Scenario:

@@ -18,7 +18,7 @@ from viz_estim.scenarios.flawed import FLAWED
 SEEDS = 10
 # Simulations as short as the flaws allow.
 SHORT: dict[str, dict[str, Any]] = {
-    "imu": {"duration": 3.0, "still": 0.6, "freeze": 0.0},
+    "imu": {"duration": 3.4, "still": 0.6, "freeze": 0.0},
     "landmarks": {"duration": 10.0},
     "quadrotor": {"duration": 4.5},
     "diffdrive": {"duration": 40.0},
@@ -30,7 +30,7 @@ OTHER: dict[str, dict[str, Any]] = {
     "process-noise-too-small": {"duration": 14.0},
     "glitches": {"duration": 20.0},
     "clipped-ranges": {"duration": 20.0},
-    "gyro-freeze": {"duration": 4.4, "still": 0.5},
+    "gyro-freeze": {"duration": 4.6},
     "bias-by-median": {"duration": 5.0, "still": 3.0},
     "delay-of-50-ms": {"duration": 4.2},
     "one-index-off": {"duration": 2.5},
@@ -42,9 +42,9 @@ STEPS = {
     "bias-by-median": 300,
     "unflipped-axes": 230,
     "gyro-rows-as-xyz": 230,
-    "degrees-as-radians": 230,
+    "degrees-as-radians": 270,
     "g-as-mps2": 100,
-    "gyro-freeze": 380,
+    "gyro-freeze": 430,
     "delay-of-50-ms": 410,
     "clamped-particles": 30,
     "noise-too-small-for-particles": 30,

@@ -26,7 +26,7 @@ from viz_estim.diagnosis import (
     truth,
 )  # fmt: skip
 from viz_estim.diagnosis.evidence import Case, case
-from viz_estim.diagnosis.finding import CODES, Finding
+from viz_estim.diagnosis.finding import CODES, SYMPTOMS, Finding
 from viz_estim.diagnosis.ranking import ranked
 from viz_estim.recording import schema
 from viz_estim.recording.links import link
@@ -51,7 +51,7 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     signatures.biases,
     errors.start,
     truth.sensors,
-    motion.prediction,
+    errors.by_part,
     covariance.broken,
     covariance.claims,
     covariance.bounds,
@@ -88,11 +88,12 @@ def diagnose(run: Run) -> list[Finding]:
         under_test = case(run, faulty)
         for check in OF_FILTERS:
             found += check(under_test)
+        if any(f.severity != "note" and (f.code in SYMPTOMS or f.code == "biased_innovation") for f in found):
+            found += motion.prediction(under_test)  # else the filter knows how wrong it is
         # Noises are tuned once nothing else is wrong: until then a factor on them would only hide it.
         causes = [f for f in ranked(found) if f.severity == "error" and f.tier <= _TIMES and f.code != "start"]
         tuned = replace(under_test, tune=not causes)
-        for check in (confidence.by_sensor, errors.by_part):
-            found += check(tuned)
+        found += confidence.by_sensor(tuned)
     return sorted(_once(ranked(found)), key=lambda finding: finding.order)
 
 

@@ -125,11 +125,16 @@ def _far(nis: Array, dof: int) -> np.ndarray:
 
 
 def factor_on_noise(readings: Readings) -> float | None:
-    """The factor f on R for which S − R + f·R brings the mean NIS to its dof; None where none does."""
+    """The factor f on R that brings the mean NIS to its dof, where `tuning` can't be asked; None where there is none.
+
+    With the state's share of S going as √f, as that of a random walk does in its steady state, P ≈ √(Q·R).
+    """
+    if not readings.noise.any():
+        return None
     spread = readings.cov - readings.noise
 
     def excess(log_f: float) -> float:
-        S = spread + np.exp(log_f) * readings.noise
+        S = np.exp(0.5 * log_f) * spread + np.exp(log_f) * readings.noise
         return float(np.nanmean(squared_distance(readings.residual, S))) / readings.dof - 1
 
     low, high = np.log(1e-4), np.log(1e6)
@@ -155,7 +160,11 @@ def _words(
     std = float(np.sqrt(np.diagonal(readings.noise, axis1=1, axis2=2).mean()))
     now = noise[1] if noise and isinstance(noise[1], float) else std
     where = noise[0] if noise else f"the standard deviation of {name}"
-    if factor is None:
+    if not readings.noise.any():
+        tuned = (
+            f"multiply the variance of {name} by about {ratio:.2g}; give `noise=R` to the recording, to be told more"
+        )
+    elif factor is None:
         tuned = f"no R alone would explain it: look at the process noise of what {name} sees"
     else:
         tuned = f"set {where} to about {now * factor**0.5:.2g} (it is {now:.2g})"

@@ -8,7 +8,7 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
-from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.evidence import Case, tells_gain
 from viz_estim.diagnosis.finding import Finding
 
 _HALF = float(np.sqrt(np.finfo(float).eps))  # half of the digits: what is beyond is no rounding that piled up
@@ -79,7 +79,7 @@ def claims(case: Case) -> Iterator[Finding]:
     below 1 by more than rounding: half of the digits, times the ratio of the variances before and after.
     """
     for table in case.run.stages.values():
-        if not {"innovation.cross_cov", "innovation.cov", "cov"} <= table.values.keys():
+        if not {"innovation.cov", "cov"} <= table.values.keys() or not tells_gain(table):
             continue
         mean, before = case.sequence.before(table)
         C, S = table.values["innovation.cross_cov"], table.values["innovation.cov"]

@@ -179,6 +179,17 @@ def once(case: Case, name: str, make: Callable[[Case], T]) -> T:
     return found
 
 
+def tells_gain(table: StageTable) -> bool:
+    """Whether an update says how readings move the state: a recording of a person's own may leave it out."""
+    cross = table.values.get("innovation.cross_cov")
+    return cross is not None and "gain" in table.values and bool(np.nan_to_num(cross).any())
+
+
+def tells_reading(predicted: Array) -> bool:
+    """Whether readings are there, and not their residuals in their stead."""
+    return bool(np.nan_to_num(predicted).any())
+
+
 def units(space: Space) -> set[str]:
     return set(space.axis_units)
 
@@ -198,6 +209,10 @@ def jacobians(P: Array, C: Array) -> Array:
 
 def transitions(case: Case, table: StageTable) -> Array | None:
     """F (M, d, d) of a prediction: as recorded, or by least squares over its sigma points."""
+    return once(case, f"_transitions of {table.name}", lambda case: _transitions(case, table))
+
+
+def _transitions(case: Case, table: StageTable) -> Array | None:
     if "transition" in table.values and table.values["transition"].shape[1:] == case.run.cov.shape[1:]:
         return table.values["transition"]
     drawn, moved = table.values.get("drawn.points"), table.values.get("propagated.points")

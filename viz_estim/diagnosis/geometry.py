@@ -9,7 +9,7 @@ import numpy as np
 from viz_estim.core.consistency import squared_distance
 from viz_estim.core.spaces import SO3, Euclidean
 from viz_estim.diagnosis.axes import explains, finding_of, maps
-from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.evidence import Case, tells_reading
 from viz_estim.diagnosis.finding import Finding, level
 from viz_estim.diagnosis.kinematics import imu_axes
 from viz_estim.recording.layout import leaves
@@ -88,6 +88,8 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         yield finding
     for name, readings in case.sensors.items():
         space = readings.space
+        if not tells_reading(readings.predicted):
+            continue
         if told or not isinstance(space, Euclidean) or not 1 <= len(space.axes) <= 3 or len(readings) < 10:
             continue
         own = float(np.nansum(readings.nis))

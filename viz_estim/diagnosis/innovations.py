@@ -76,11 +76,22 @@ def coloured(case: Case) -> Iterator[Finding]:
             seconds = float(np.median(readings.time[lag + 1 :] - readings.time[: -(lag + 1)]))
             evidence = {"ljung_box": Q, "p": p, "lag": int(lag) + 1, "lag_s": seconds, "autocorrelation": strongest}
             yield Finding(
-                "coloured_innovation", severity, name, readings.steps, evidence, *_colour(name, strongest, seconds)
+                "coloured_innovation",
+                severity,
+                name,
+                readings.steps,
+                evidence,
+                *_colour(name, strongest, seconds, float(np.median(readings.nis)) < chi2.median(readings.dof)),
             )
 
 
-def _colour(name: str, strongest: float, seconds: float) -> tuple[str, str]:
+def _colour(name: str, strongest: float, seconds: float, small: bool) -> tuple[str, str]:
+    if strongest > 0 and small:
+        return (
+            f"an innovation of {name} is like the one {seconds:.3g} s before it (correlation {strongest:.2f}), and "
+            "they are smaller than S says: the gain is too small, as with an R that is too large",
+            f"lower the noise of {name} and see whether the correlation falls; else the sensor's own noise is slow",
+        )
     if strongest > 0:
         return (
             f"an innovation of {name} is like the one {seconds:.3g} s before it (correlation {strongest:.2f}): what is "

@@ -12,7 +12,7 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
-from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.evidence import Case, tells_gain
 from viz_estim.diagnosis.finding import Finding
 
 _UNEXPLAINED = 0.3  # the share of the model's change that a Jacobian leaves; a right one leaves less than a hundredth
@@ -22,8 +22,7 @@ _FEWEST = 10
 def measured(case: Case) -> Iterator[Finding]:
     """H against how the expected reading changes with the state; H = Cᵀ·P⁻¹, as the update used it."""
     for table in case.run.stages.values():
-        known = {"innovation.cross_cov", "gain"} <= table.values.keys()  # a person's own record may lack them
-        if not known or any(key.endswith(".points") for key in table.values):
+        if not tells_gain(table) or any(key.endswith(".points") for key in table.values):
             continue  # sigma points have no Jacobian that could be wrong
         space = table.spaces["innovation"]
         assert isinstance(space, Product)

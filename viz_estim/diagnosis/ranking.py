@@ -20,8 +20,6 @@ def ranked(found: list[Finding]) -> list[Finding]:
     found = [f for f in found if not (f.evidence.get("against") == "truth" and f.sensor in wrong and f.sensor)]
     seen = {(f.code, f.sensor) for f in found if f.evidence.get("against") == "truth"}
     found = [f for f in found if f.evidence.get("against") == "truth" or (f.code, f.sensor) not in seen]
-    if not any(f.severity != "note" and (f.code in SYMPTOMS or f.code == "biased_innovation") for f in found):
-        found = [f for f in found if f.code != "process_model"]  # a filter that knows how wrong it is
     if any(f.severity == "error" and f.code == "biased_innovation" and "bias" in f.evidence for f in found):
         # Which sensor's bias explains the innovations is known: those of others lie off for it.
         best = next(

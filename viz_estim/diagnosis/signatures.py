@@ -18,7 +18,7 @@ from scipy.stats import chi2, norm, t
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
-from viz_estim.diagnosis.evidence import Case, jacobians, once, parameter, transitions
+from viz_estim.diagnosis.evidence import Case, jacobians, once, parameter, tells_gain, transitions
 from viz_estim.diagnosis.finding import Finding, judge
 from viz_estim.recording.tables import StageTable
 
@@ -103,7 +103,7 @@ def faults(case: Case) -> list[Fault]:
     for name, table in case.run.stages.items():
         if (F := transitions(case, table)) is not None:
             moves[name] = F
-        elif {"innovation.cross_cov", "gain"} <= table.values.keys():
+        elif tells_gain(table):
             updates[name] = _Update(case, table)
         elif name != "start" and "mean" in table.values and name.startswith("predict"):
             return []

@@ -17,7 +17,7 @@ from scipy.stats import chi2, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean, Product, Space
 from viz_estim.diagnosis.axes import explains, maps, units
-from viz_estim.diagnosis.evidence import Case, jacobians, parameter
+from viz_estim.diagnosis.evidence import Case, jacobians, parameter, tells_gain, tells_reading
 from viz_estim.diagnosis.finding import Finding, judge
 
 FEWEST = 30
@@ -96,7 +96,7 @@ def _against(case: Case) -> Iterator[Against]:
         return
     row = {int(step): k for k, step in enumerate(run.step)}
     for table in run.stages.values():
-        if "innovation.cross_cov" not in table.values or "innovation.z" not in table.values:
+        if not tells_gain(table) or not tells_reading(table.values["innovation.predicted"]):
             continue
         space = table.spaces["innovation"]
         assert isinstance(space, Product)

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 from viz_estim.core.consistency import squared_distance
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
-from viz_estim.diagnosis.evidence import Case, jacobians, once, transitions
+from viz_estim.diagnosis.evidence import Case, jacobians, once, tells_gain, transitions
 from viz_estim.recording.tables import StageTable
 
 _GRID = np.arange(-6.0, 6.5) * np.log(10) / 2  # log factors, 10⁻³ to 10³
@@ -47,11 +47,7 @@ def _factors(case: Case) -> dict[str, Tuned]:
     if run.labels or "cov" not in run.ends:
         return {}
     moves = {name: F for name, table in run.stages.items() if (F := transitions(case, table)) is not None}
-    updates = {
-        name: table
-        for name, table in run.stages.items()
-        if {"innovation.cross_cov", "innovation.noise", "gain"} <= table.values.keys()
-    }
+    updates = {name: table for name, table in run.stages.items() if tells_gain(table)}
     if any(name.startswith("predict") and name not in moves for name in run.stages) or not updates:
         return {}
     names = list(dict.fromkeys(n.partition("/")[0] for t in updates.values() for n in _parts(t)))
