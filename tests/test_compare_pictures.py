@@ -28,7 +28,7 @@ KINDS: dict[str, list[list[str]]] = {
     "clouds": [_CLOUD, [*_CLOUD, "--set=range_noise=2"]],
 }
 AT = {"attitudes": 2.5, "six robots": 2.0, "three bars": 30.0, "clouds": 2.0}
-SIZE, HEAD, FOOT = (1100, 800), 37, 28  # a window, and what the viewer takes of it above and below the views
+SIZE, HEAD, FOOT = (900, 680), 37, 28  # a window, and what the viewer takes of it above and below the views
 
 
 @pytest.fixture(scope="module")
