@@ -23,7 +23,7 @@ from viz_estim.core.run import Scenario, Step, Tick, run
 from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product
 from viz_estim.core.stages import Stage
 from viz_estim.differences import first_difference, other_data
-from viz_estim.recording import overlaid_stages
+from viz_estim.recording import links, overlaid_stages
 from viz_estim.recording.compared import Clock, Compared
 from viz_estim.recording.merged import _recoloured
 from viz_estim.recording.reader import Run, load
@@ -525,6 +525,24 @@ def test_a_killed_run_is_compared_as_far_as_it_goes(cli: Cli, made: dict[str, Pa
         assert found["same"]
     assert "cut off" in cli("compare", made["ukf"], cut, "--out", tmp_path / "out.rrd").out
     assert any(entity.startswith("/runs/cut/") for entity in entities(tmp_path / "out.rrd"))
+
+
+@pytest.mark.parametrize(
+    ("entity", "selected"), [("/lanes/01_frozen_range/1", "/lanes/01_frozen_range/1"), ("/runs/a\\ b/steps", "/runs")]
+)
+def test_a_panel_s_links_go_to_the_time_in_the_viewer_that_holds_it(entity: str, selected: str) -> None:
+    """The address is the one that the real viewer follows, in `test_compare_pictures`."""
+    text = f"see {links.link('step 3', entity, 0.25)} and [others](https://rerun.io)"
+    blueprint = {
+        "/view/v": {"ViewBlueprint": {"a": 1}},
+        "/view/v/o": {"TextDocument": {"text": text, "media_type": "m"}},
+    }
+    moved = links.moving(blueprint, "rerun+http://127.0.0.1:1", "Recording:18EB:ab12")
+    assert moved is not None
+    url = f"rerun+http://127.0.0.1:1/dataset/18EB?segment_id=ab12#selection={selected}&when=time@0.250000000s"
+    assert moved["/view/v/o"]["TextDocument"]["text"] == f"see [→ step 3]({url}) and [others](https://rerun.io)"
+    assert moved["/view/v"] == blueprint["/view/v"]
+    assert links.moving({"/view/v": {"ViewBlueprint": {"a": 1}}}, "rerun+http://127.0.0.1:1", "Recording:1:2") is None
 
 
 # Usage.
