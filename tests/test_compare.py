@@ -23,7 +23,7 @@ from viz_estim.core.run import Scenario, Step, Tick, run
 from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product
 from viz_estim.core.stages import Stage
 from viz_estim.differences import first_difference, other_data
-from viz_estim.recording import overlaid_stages
+from viz_estim.recording import links, overlaid_stages
 from viz_estim.recording.compared import Clock, Compared
 from viz_estim.recording.merged import _recoloured
 from viz_estim.recording.reader import Run, load
@@ -55,8 +55,8 @@ def made(cli: Cli, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "loose": ["imu-ukf", *short, "--seed", "3", "--set", "gyro_noise=0.2"],
         "gyro": ["imu-gyro", *short, "--seed", "3"],
         "alone": ["imu-ukf-gyro", *short, "--seed", "3"],
-        "other": ["imu-ukf", *short, "--seed", "4"],
-        "longer": ["imu-ukf", *short, "--seed", "3", "--set", "data.noise_scale=2"],
+        "other": ["imu-gyro", *short, "--seed", "4"],
+        "longer": ["imu-gyro", *short, "--seed", "3", "--set", "data.noise_scale=2"],
         "drive": ["diffdrive-ekf", "--set", "data.duration=3", "--seed", "1"],
         "labels": ["underwater-bayes", "--set", "data.steps=40", "--seed", "1"],
         "stay": ["underwater-bayes", "--set", "data.steps=40", "--seed", "1", "--set", "stay=0.8"],
@@ -189,18 +189,19 @@ def naive(a: Run, b: Run, tol: float) -> tuple[int, str, str, float] | None:
 
 
 def test_tol_bounds_the_ratio(cli: Cli, made: dict[str, Path], tmp_path: Path) -> None:
-    out = tmp_path / "out.rrd"
     steps = []
     a, b = (load(made[name], points=False) for name in ("ukf", "loose"))
     for tol in (0, 1e-9, 1e-3, 0.1, 1.0):
-        found = answer(cli("compare", made["ukf"], made["loose"], "--out", out, "--tol", tol, "--json"))
         expected = naive(a, b, tol)
+        difference = first_difference(a, b, tol)
         assert expected is not None
-        difference = found["first_difference"]
-        assert (difference["step"], difference["stage"], difference["quantity"]) == expected[:3]
-        assert difference["by"] > tol
-        steps.append(difference["step"])
+        assert difference is not None
+        assert difference[:3] == expected[:3]
+        assert difference.by is not None
+        assert difference.by > tol
+        steps.append(difference.step)
     assert steps == sorted(steps)
+    out = tmp_path / "out.rrd"
     assert answer(cli("compare", made["ukf"], made["loose"], "--out", out, "--tol", 1e9, "--json"))["same"]
 
 
@@ -524,6 +525,24 @@ def test_a_killed_run_is_compared_as_far_as_it_goes(cli: Cli, made: dict[str, Pa
         assert found["same"]
     assert "cut off" in cli("compare", made["ukf"], cut, "--out", tmp_path / "out.rrd").out
     assert any(entity.startswith("/runs/cut/") for entity in entities(tmp_path / "out.rrd"))
+
+
+@pytest.mark.parametrize(
+    ("entity", "selected"), [("/lanes/01_frozen_range/1", "/lanes/01_frozen_range/1"), ("/runs/a\\ b/steps", "/runs")]
+)
+def test_a_panel_s_links_go_to_the_time_in_the_viewer_that_holds_it(entity: str, selected: str) -> None:
+    """The address is the one that the real viewer follows, in `test_compare_pictures`."""
+    text = f"see {links.link('step 3', entity, 0.25)} and [others](https://rerun.io)"
+    blueprint = {
+        "/view/v": {"ViewBlueprint": {"a": 1}},
+        "/view/v/o": {"TextDocument": {"text": text, "media_type": "m"}},
+    }
+    moved = links.moving(blueprint, "rerun+http://127.0.0.1:1", "Recording:18EB:ab12")
+    assert moved is not None
+    url = f"rerun+http://127.0.0.1:1/dataset/18EB?segment_id=ab12#selection={selected}&when=time@0.250000000s"
+    assert moved["/view/v/o"]["TextDocument"]["text"] == f"see [→ step 3]({url}) and [others](https://rerun.io)"
+    assert moved["/view/v"] == blueprint["/view/v"]
+    assert links.moving({"/view/v": {"ViewBlueprint": {"a": 1}}}, "rerun+http://127.0.0.1:1", "Recording:1:2") is None
 
 
 # Usage.

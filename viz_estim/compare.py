@@ -28,7 +28,7 @@ def compare(paths: list[Path], out: Path | None, tol: float) -> tuple[dict[str, 
     path = _target(paths, out, names)
     runs, figures = [], []
     for file in paths:
-        run = _loaded(file)
+        run = load(file, points=None)
         figures.append(run.summary())
         runs.append(light(run))
     reasons = [None, *(other_data(runs[0], run) for run in runs[1:])]
@@ -58,12 +58,6 @@ def compare(paths: list[Path], out: Path | None, tol: float) -> tuple[dict[str, 
     merged.write(path, compared, result, notes)
     lines = comparison_table.text(names, table, shutil.get_terminal_size((120, 24)).columns)
     return result, "\n".join([*lines, *verdicts, f"viz-estim open {path}"])
-
-
-def _loaded(file: Path) -> Run:
-    """A run without its points, which are most of its bytes; of particles with them, for the stages' means."""
-    run = load(file, points=False)
-    return load(file) if run.properties.get("particles") else run
 
 
 def _names(paths: list[Path]) -> list[str]:

@@ -117,8 +117,9 @@ class Run:
         return summary(self.space, ends, self.truth[counts], innovations, facts)
 
 
-def load(path: str | Path, *, points: bool = True) -> Run:
-    """Reads a recording into arrays. points: also the sigma points, which are most of its bytes.
+def load(path: str | Path, *, points: bool | None = True) -> Run:
+    """Reads a recording into arrays. points: also the points and clouds, which are most of its bytes; None: the clouds
+    alone, from which the mean and covariance within a step are worked out.
 
     BadInput where the file is missing, damaged, or not a recording of this project.
     """
@@ -136,7 +137,8 @@ def load(path: str | Path, *, points: bool = True) -> Run:
         elif entity == "/events":
             error = _texts(chunk.to_record_batch()).get("TextLog:text")
         elif entity.startswith("/stages/"):
-            stages.setdefault(entity.removeprefix("/stages/"), Gathered(points)).add(chunk.to_record_batch())
+            keep = "particles" in properties if points is None else points  # properties come first
+            stages.setdefault(entity.removeprefix("/stages/"), Gathered(keep)).add(chunk.to_record_batch())
     if properties.keys() & {"space", "labels"} and not steps.times:
         raise NotARun(f"{path}: the run was cut off before its first steps were written")
     if not properties.keys() & {"space", "labels"}:
