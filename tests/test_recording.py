@@ -15,6 +15,7 @@ from rerun.chunk import RrdReader
 import viz_estim
 from viz_estim.core.beliefs import Gaussian, Particles
 from viz_estim.core.measurement import Measurement, Sensor
+from viz_estim.core.particle import equal, resample, weigh
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario, Step, Tick, run
 from viz_estim.core.spaces import SO3, Euclidean, Product
@@ -27,9 +28,10 @@ from viz_estim.running import find, plan
 from viz_estim.scenarios import SCENARIOS
 
 ODD, SHARED = "stages that differ from step to step", "two stages that share a sensor"
+STILL = "particles without a process, moved after some of their resamplings"
 # What stands in a scene through all stages, by its place in the entity's path.
 STANDING = ("estimate", "truth", "scenery", "moved", "particles", "modes", "camera")
-every_scenario = pytest.mark.parametrize("name", [*SCENARIOS, ODD, SHARED])
+every_scenario = pytest.mark.parametrize("name", [*SCENARIOS, ODD, SHARED, STILL])
 Kept = dict[str, tuple[Path, list[Step]]]
 
 
@@ -68,6 +70,28 @@ class Odd:
             yield Learn("learn", belief, rng.standard_normal(3), rng.standard_normal((2, 4)))
 
 
+@dataclasses.dataclass(frozen=True)
+class Still:
+    """Particles that are weighed and resampled where they stood at the end of the step before; at every third step a
+    resampling moves its copies too."""
+
+    def step(self, belief: Particles, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
+        weighed = weigh(belief, lambda x, tick: -np.square(x[..., 0] - tick.measurements["z"][0]), tick)
+        yield weighed
+        drawn = resample(weighed.belief, rng)
+        if round(10 * tick.time) % 3 == 0:
+            moved = drawn.belief.states + 0.1 * rng.standard_normal(drawn.belief.states.shape)
+            drawn = dataclasses.replace(drawn, belief=dataclasses.replace(drawn.belief, states=moved))
+        yield drawn
+
+
+def still() -> Scenario:
+    rng = np.random.default_rng(2)
+    belief = equal(Product(position=Euclidean(("x", "y"), "m")), rng.standard_normal((50, 2)))
+    ticks = [Tick(k / 10, 0.1, measurements={"z": rng.standard_normal(1)}) for k in range(40)]
+    return Scenario(Still(), {0: belief}, ticks)
+
+
 def made_up(estimator: Odd) -> Scenario:
     belief = Gaussian(Product(attitude=SO3()), np.array([1.0, 0, 0, 0]), 0.01 * np.eye(3))
     gps = np.random.default_rng(0).standard_normal((40, 3))
@@ -77,6 +101,8 @@ def made_up(estimator: Odd) -> Scenario:
 
 def scenario(name: str) -> Scenario:
     """A scenario on short simulated data, whatever its data function can be told."""
+    if name == STILL:
+        return still()
     if name in (ODD, SHARED):
         return made_up(Odd(again=name == SHARED))
     source = find(name)

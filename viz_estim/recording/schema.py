@@ -129,7 +129,8 @@ ENTITIES = (
         "/stages/{stage}",
         "`viz_estim.Stage`: the belief (mean, cov; log_probabilities; states, log_weights) and the stage's own numbers "
         "(`gain`, `innovation.residual`, `sigma.points`, `ancestors`, `matches.source`, …), float64, row-major; what "
-        "all rows share is in the first, points of the stage before are in that one",
+        "all rows share is in the first, points of the stage before are in that one, equal log_weights are one, and "
+        "copies are known by their ancestors",
         "SI, rad",
         "covariances: " + _TANGENT,
     ),
