@@ -230,19 +230,21 @@ COMMANDS = [
     "compare {n}", "help", "help st", "", "bogus", "set data.q=1", "set q", "set 'q", "break", "save", "save x.txt",
     "goto", "goto -3", "step -1", "\x00", "print", "sw", "?", "step 1 2", "back 99", "step 99", "stage 9999",
     "delete", "switch", "b", "c", "p mean", "break finding", "break finding and step > {k}", "print finding",
-    "save a.rrd",
 ]  # fmt: skip
 
 
 def random_script(rng: np.random.Generator, length: int) -> str:
+    def one_of(choices: list[str]) -> str:
+        return choices[rng.integers(len(choices))]
+
     lines = []
     for _ in range(length):
         words = {
             "k": rng.integers(0, 30), "t": f"{rng.uniform(-1, 4):.3f}", "n": rng.integers(0, 5),
-            "x": f"{rng.normal():.2f}", "y": f"{rng.choice([0.05, 0.3, -1.0]):.2f}", "e": rng.choice(EXPRESSIONS),
-            "p": rng.choice(["q", "r", "start", "noise", "fails", "quux"]),
+            "x": f"{rng.normal():.2f}", "y": one_of(["0.05", "0.30", "-1.00"]), "e": one_of(EXPRESSIONS),
+            "p": one_of(["q", "r", "start", "noise", "fails", "quux"]),
         }  # fmt: skip
-        line = str(rng.choice(COMMANDS))
+        line = one_of(COMMANDS)
         for key, word in words.items():
             line = line.replace(f"{{{key}}}", str(word))
         lines.append(line)
