@@ -30,7 +30,7 @@ OTHER: dict[str, dict[str, Any]] = {
     "process-noise-too-small": {"duration": 14.0},
     "glitches": {"duration": 20.0},
     "clipped-ranges": {"duration": 20.0},
-    "gyro-freeze": {"duration": 4.6},
+    "gyro-freeze": {"duration": 4.6, "freeze": 1.5},
     "bias-by-median": {"duration": 5.0, "still": 3.0},
     "delay-of-50-ms": {"duration": 4.2},
     "one-index-off": {"duration": 2.5},

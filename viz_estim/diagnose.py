@@ -174,7 +174,7 @@ def _failure(run: Run) -> list[Finding]:
             (step, step),
             {"message": run.error},
             f"the filter raised at {run.error}",
-            f"open the recording at step {step}: the stages before the failure are there",
+            f"`viz-estim debug FILE` opens at step {step}, with the stages that came before the failure",
         )
     ]
 

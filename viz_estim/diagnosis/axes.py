@@ -11,7 +11,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.finding import Finding
 from viz_estim.scenarios.imu_health import GRAVITY
 
-_AXES, _UNIT = 0.5, 0.9  # of the misfit, for a map to be named: a unit is off by a factor, and leaves noise alone
+_AXES, _UNIT = 0.5, 0.8  # of the misfit, for a map to be named: a unit is off by a factor, and leaves noise alone
 UNITS = {  # by what a sensor reads: the factor that brings a reading to what was expected
     "rad": {"degrees for radians": np.pi / 180, "radians for degrees": 180 / np.pi},
     "m/s²": {"g for m/s²": GRAVITY, "m/s² for g": 1 / GRAVITY},

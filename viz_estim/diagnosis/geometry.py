@@ -9,6 +9,7 @@ import numpy as np
 from viz_estim.core.consistency import squared_distance
 from viz_estim.core.spaces import SO3, Euclidean
 from viz_estim.diagnosis.axes import explains, finding_of, maps
+from viz_estim.diagnosis.covariance import epsilon
 from viz_estim.diagnosis.evidence import Case, tells_reading
 from viz_estim.diagnosis.finding import Finding, level
 from viz_estim.diagnosis.kinematics import imu_axes
@@ -43,7 +44,11 @@ def wraps(case: Case) -> Iterator[Finding]:
 
 
 def quaternion_norms(case: Case) -> Iterator[Finding]:
-    """Quaternions off the unit sphere by more than rounding, and estimates that change their sign from step to step."""
+    """Quaternions off the unit sphere by more than rounding, and estimates that change their sign from step to step.
+
+    A product of unit quaternions is off by 4ε at most, a turn by an angle by as much again; of N steps without any
+    normalising, by 8·N·ε, with ε that of the numbers held (`covariance.epsilon`). It can't be by chance.
+    """
     run = case.run
     parts = [(name, at) for name, part, at in leaves(case.space) if isinstance(part, SO3)]
     for name, at in parts:
@@ -51,7 +56,7 @@ def quaternion_norms(case: Case) -> Iterator[Finding]:
         for stage, table in run.stages.items():
             q = table.values["mean"][:, at] if "mean" in table.values else np.empty((0, 4))
             error = np.abs(np.linalg.norm(q, axis=1) - 1)
-            rows = np.flatnonzero(error > 1e-7)
+            rows = np.flatnonzero(error > 8 * len(run.step) * epsilon(q))
             off += [(int(table.step[row]), float(error[row]), stage) for row in rows]
         if off:
             steps = min(off)[0], max(off)[0]

@@ -226,10 +226,10 @@ def _blocks(readings: Readings) -> tuple[int, int]:
 
 
 def lost(case: Case) -> Iterator[Finding]:
-    """The error leaves for good: from some step to the end every NEES is beyond χ²'s quantile of 10⁻⁶.
+    """The error leaves for good: from some step to the end every NEES is beyond χ²'s quantile of an error's level.
 
-    One step alone would make that a false alarm once in a million; at most a warning where it lasts less than a tenth
-    of the run.
+    Whatever came before, that takes the last step to be beyond it, which chance does with that level. At most a warning
+    where it lasts less than a tenth of the run.
     """
     run = case.run
     if run.labels or "mean" not in run.ends or run.properties.get("belief") == "Particles":
@@ -238,7 +238,7 @@ def lost(case: Case) -> Iterator[Finding]:
     rows = np.flatnonzero(np.isfinite(values) & (run.step >= case.first))
     if len(rows) < _FEWEST:
         return
-    inside = np.flatnonzero(values[rows] <= chi2.isf(1e-6, dof))
+    inside = np.flatnonzero(values[rows] <= chi2.isf(level("error", 1), dof))
     start = int(inside[-1]) + 1 if len(inside) else 0
     lasting = len(rows) - start
     if lasting < max(3, len(rows) // 20):

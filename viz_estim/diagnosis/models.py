@@ -15,7 +15,9 @@ from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.evidence import Case, tells_gain
 from viz_estim.diagnosis.finding import Finding
 
-_UNEXPLAINED = 0.3  # the share of the model's change that a Jacobian leaves; a right one leaves less than a hundredth
+# The share of the model's change that a Jacobian leaves. Where it changes the expected by less than a tenth in a step,
+# the trapezoid rule is off by a third of the square of that, 0.3 %, and a wrong row or sign by more than a half.
+_UNEXPLAINED = 0.3
 _FEWEST = 10
 
 
