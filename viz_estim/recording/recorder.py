@@ -6,6 +6,8 @@ import dataclasses
 import json
 import os
 import re
+import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,6 @@ from viz_estim.recording.registration import Registration
 from viz_estim.recording.scenes import Scenes
 from viz_estim.recording.stage_columns import stage_columns
 from viz_estim.recording.standing import Standing
-from viz_estim.recording.writer import Writer
 
 # A batch is cut by rows and bytes, which the same seed repeats; by time only where steps are so slow that a kill would
 # lose a second of them, or while a viewer watches.
@@ -59,10 +60,14 @@ class Recorder:
         self._every = every
         self._layout = Layout(scenario)
         self._last: Stage | None = None  # of the steps sent so far
-        self._sized = 0  # steps, whose size says how many there are to a batch
+        self._rows: list[Step] = []
+        self._limit = _ROWS[1]  # steps to a batch; the first few tell the size of the others
+        self._sized = 0
         self._viewed: list[str] | None = None
         self._places = 0  # taken on the stage timeline
-        self._closed = False
+        self._lock = threading.Lock()
+        self._failed: Exception | None = None
+        self._closed = threading.Event()
         name = str(properties.get("scenario", path.stem))
         # A view belongs to an application id: runs of one scenario share what a person arranges in the viewer.
         plain = re.sub(r"[^A-Za-z0-9_-]+", "-", name)  # Rerun renames others, and says so
@@ -87,28 +92,36 @@ class Recorder:
         self._send_properties()
         notes = f"{scenario.notes}\n\n{blueprints.legend(self._layout)}".strip()
         send_static(self._stream, schema.NOTES, rr.TextDocument(notes, media_type="text/markdown"))
-        patience = _SECONDS_WATCHED if live else _SECONDS
-        self._writer = Writer(
-            self._write, self._stream.flush, _ROWS[1], patience
-        )  # flushed to the file: a kill may come
+        self._patience = _SECONDS_WATCHED if live else _SECONDS
+        self._oldest = 0.0  # when the first of the buffered rows came
+        self._timer = threading.Thread(target=self._tick, daemon=True)
+        self._timer.start()
 
     def add(self, step: Step) -> None:
         """Takes in one step; it reaches the file within a second."""
-        if self._clouds:
-            step = self._clouds.take(step)
-        if self._sized < 3:
-            self._sized += 1
-            few, most = (limit // max(1, _size(step)) for limit in _BYTES)
-            self._writer.limit = max(1, min(self._writer.limit, max(few, _ROWS[0]), most))
-        self._writer.add(step)
+        if self._failed:
+            raise self._failed
+        with self._lock:
+            if self._clouds:
+                step = self._clouds.take(step)
+            if not self._rows:
+                self._oldest = time.monotonic()
+            self._rows.append(step)
+            if self._sized < 3:
+                self._sized += 1
+                few, most = (limit // max(1, _size(step)) for limit in _BYTES)
+                self._limit = max(1, min(self._limit, max(few, _ROWS[0]), most))
+            if len(self._rows) >= self._limit:
+                self._flush()
 
     def close(self, result: dict[str, Any] | None = None, *, facts: Mapping[str, float] | None = None) -> None:
         """Ends the recording well: the result is kept with it, and the file takes its own name.
 
         facts: the scenario's, with the figures of its last step.
         """
-        self._closed = True
-        self._writer.stop()
+        self._stop()
+        if self._failed:
+            raise self._failed
         self._properties["result"] = result
         self._properties["facts"] |= facts or {}
         self._send_properties()
@@ -117,29 +130,50 @@ class Recorder:
 
     def abort(self) -> None:
         """Ends the recording where it is; the partial file stays."""
-        self._closed = True
-        try:
-            self._writer.stop()
-        finally:
-            self._disconnect()
+        self._stop()
+        self._disconnect()
 
     def __enter__(self) -> Recorder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
-        if not self._closed:
+        if not self._closed.is_set():
             self.abort() if kind else self.close()
+
+    def _stop(self) -> None:
+        self._closed.set()
+        self._timer.join()
+        with self._lock:
+            self._flush()
 
     def _disconnect(self) -> None:
         self._stream.flush()
         self._stream.disconnect()
 
+    def _tick(self) -> None:
+        written = 0
+        while not self._closed.wait(self._patience / 8):
+            try:
+                with self._lock:
+                    if self._rows and time.monotonic() - self._oldest >= self._patience:
+                        self._flush()
+                    places = self._places
+                if places != written:  # to the file, for a kill may come; steps go on meanwhile
+                    self._stream.flush()
+                    written = places
+            except Exception as error:  # told at the next step, in the thread that can act on it
+                self._failed = error
+                return
+
     def _send_properties(self) -> None:
         texts = {name: json.dumps(value) for name, value in (self._properties | self._layout.as_json()).items()}
         send_static(self._stream, "/__properties/viz_estim", rr.AnyValues(drop_untyped_nones=False, **texts))
 
-    def _write(self, steps: list[Step]) -> None:
-        """Sends the steps, their stages by name, and what is drawn of them."""
+    def _flush(self) -> None:
+        """Sends what is buffered: the steps, their stages by name, and what is drawn of them."""
+        steps, self._rows = self._rows, []
+        if not steps:
+            return
         batch = Batch(steps, self._places, self._last)
         self._places, self._last = batch.end, batch.last
         if self._layout.learn(batch):  # before the columns that it describes: the file may be cut between them
