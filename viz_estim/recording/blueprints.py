@@ -132,7 +132,7 @@ def _scene(origin: str, name: str, size: float) -> rrb.Spatial3DView:
 
 def _probabilities() -> rrb.Container:
     axis = rrb.ScalarAxis(range=(0.0, 1.0))
-    return rrb.Vertical(_plot("probability", "labels", "Probability of each label", axis, legend=True), name="Belief")
+    return rrb.Vertical(graph("probability", "labels", "Probability of each label", axis, legend=True), name="Belief")
 
 
 def _health(layout: Layout) -> list[_Item]:
@@ -141,13 +141,13 @@ def _health(layout: Layout) -> list[_Item]:
     for name, part in layout.space.parts.items():
         if name in layout.true_parts:
             views = [
-                _plot("error", f"{name}.{axis}", f"{_titled(name, axis)} error{_unit(part, i)} ±3σ")
+                graph("error", f"{name}.{axis}", f"{_titled(name, axis)} error{_unit(part, i)} ±3σ")
                 for i, axis in enumerate(part.axes)
             ]
             errors += _rows(views)
     what = " innov." if len(layout.sensors) < 4 else ""  # four in a row leave no place for the word
     views = [
-        _plot("innovation", f"{name}.{axis}", f"{_titled(name, axis)}{what}{_unit(space, i)} ±3σ")
+        graph("innovation", f"{name}.{axis}", f"{_titled(name, axis)}{what}{_unit(space, i)} ±3σ")
         for name, space in layout.sensors.items()
         for i, axis in enumerate(space.axes)
     ]
@@ -159,7 +159,7 @@ def _health(layout: Layout) -> list[_Item]:
             dof = len(space.axes)
             axis = rrb.ScalarAxis(range=(0.0, 3 * band(dof)[1]))
             title = f"NIS {name}: {dof} expected, 95 % between the lines" if len(layout.sensors) < 3 else f"NIS {name}"
-            bands.append(_plot("nis", name, title, axis))
+            bands.append(graph("nis", name, title, axis))
         innovations += _rows(bands)
     if len(errors) + len(innovations) > _MANY and errors and innovations:
         return [rrb.Vertical(*innovations, name="Innovations"), rrb.Vertical(*errors, name="Errors")]
@@ -170,7 +170,7 @@ def _health(layout: Layout) -> list[_Item]:
 def _figures(layout: Layout) -> list[_Item]:
     """The single numbers of stages, over time."""
     views = [
-        _plot("figure", f"{stage}.{field}", f"{stage}: {field}")
+        graph("figure", f"{stage}.{field}", f"{stage}: {field}")
         for stage, fields in layout.stages.items()
         for field, what in fields.items()
         if what.get("shape") == []
@@ -183,7 +183,7 @@ def _state(layout: Layout) -> rrb.Container:
     rows: list[_Item] = []
     for name, part in layout.space.parts.items():
         views = [
-            _plot(
+            graph(
                 "state", f"{name}.{component}", f"{_titled(name, component)}{_unit(part, i, part.units)}", legend=i == 0
             )
             for i, component in enumerate(part.names)
@@ -200,7 +200,7 @@ def _moved(layout: Layout) -> list[_Item]:
     rows: list[_Item] = []
     for name, part in layout.space.parts.items():
         views = [
-            _plot("moved", f"{name}.{axis}", f"K·ν on {_titled(name, axis)} [σ before]", legend=not rows and i == 0)
+            graph("moved", f"{name}.{axis}", f"K·ν on {_titled(name, axis)} [σ before]", legend=not rows and i == 0)
             for i, axis in enumerate(part.axes)
         ]
         rows += _rows(views)
@@ -223,12 +223,13 @@ def _rows(views: Sequence[_Item], widths: list[int] | None = None) -> list[_Item
 
 
 def _sigmas(layout: Layout) -> list[_Item]:
-    return [_plot("sigma", name, f"{name} σ{_unit(part)}", legend=True) for name, part in layout.space.parts.items()]
+    return [graph("sigma", name, f"{name} σ{_unit(part)}", legend=True) for name, part in layout.space.parts.items()]
 
 
-def _plot(
+def graph(
     group: str, component: str, name: str, axis: rrb.ScalarAxis | None = None, *, legend: bool = False
 ) -> rrb.TimeSeriesView:
+    """One plot of a group, in step with all others."""
     return rrb.TimeSeriesView(
         origin=schema.plot(group, component),
         name=name,

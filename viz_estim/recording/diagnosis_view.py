@@ -8,6 +8,7 @@ from rerun.blueprint.encodings import TextLogColumn, TextLogColumnKind
 
 from viz_estim.core.consistency import band
 from viz_estim.recording import links, schema
+from viz_estim.recording.blueprints import graph
 from viz_estim.recording.compared import Alone, is_figure
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.lines import shown
@@ -90,9 +91,9 @@ def _innovations(alone: Alone) -> list[_Plots]:
         for name, part in as_product(table.spaces.get("innovation")).parts.items():
             dof = len(part.axes)
             top = rrb.ScalarAxis(range=(0.0, 4 * band(dof)[1]))
-            views = [_plot("nis", name, f"NIS {name}", top)]
+            views = [graph("nis", name, f"NIS {name}", top)]
             for axis, unit in zip(part.axes, part.axis_units, strict=True):
-                views.append(_plot("innovation", f"{name}.{axis}", titled(name, axis, shown(unit)[0], "innov.")))
+                views.append(graph("innovation", f"{name}.{axis}", titled(name, axis, shown(unit)[0], "innov.")))
             groups.append(views)
     return groups
 
@@ -101,7 +102,7 @@ def _errors(alone: Alone) -> list[_Plots]:
     run, space = alone.run, alone.space
     return [
         [
-            _plot("error", f"{name}.{axis}", titled(name, axis, shown(unit)[0], "error"))
+            graph("error", f"{name}.{axis}", titled(name, axis, shown(unit)[0], "error"))
             for axis, unit in zip(part.axes, part.axis_units, strict=True)
         ]
         for name, part in space.parts.items()
@@ -113,14 +114,14 @@ def _belief(alone: Alone) -> list[_Plots]:
     if not alone.run.labels:
         return []
     return [
-        [_plot("probability", "labels", "Probability of each label", rrb.ScalarAxis(range=(0.0, 1.0)), legend=True)]
+        [graph("probability", "labels", "Probability of each label", rrb.ScalarAxis(range=(0.0, 1.0)), legend=True)]
     ]
 
 
 def _figures(alone: Alone) -> list[_Plots]:
     groups = [
         [
-            _plot("figure", f"{table.name}.{name}", f"{table.name}: {name}")
+            graph("figure", f"{table.name}.{name}", f"{table.name}: {name}")
             for name, values in table.values.items()
             if is_figure(name, values) and np.isfinite(values).any()
         ]
@@ -145,15 +146,3 @@ def _tabs(title: str, groups: list[_Plots]) -> list[_Item]:
         rrb.Vertical(*(rrb.Horizontal(*row) for row in part), name=f"{title} {i}" if i > 1 else title)
         for i, part in enumerate(parts, 1)
     ]
-
-
-def _plot(
-    group: str, component: str, name: str, axis: rrb.ScalarAxis | None = None, *, legend: bool = False
-) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(
-        origin=schema.plot(group, component),
-        name=name,
-        axis_y=axis,
-        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
-        plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
-    )

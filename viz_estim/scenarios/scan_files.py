@@ -19,6 +19,7 @@ from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, whole
 from viz_estim.scenarios import scan_ply
 from viz_estim.scenarios.reading import expand, unreadable
+from viz_estim.scenarios.tables import is_number
 
 _SUFFIXES = (".txt", ".csv", ".xyz", ".ply")  # of what a folder is searched for
 _SAVED = ("cloudX.csv", "cloudY.csv", "cloudList.csv")
@@ -156,7 +157,7 @@ def _read_text(path: Path) -> tuple[list[str], list[tuple[int, str]]]:
     if lines and lines[0][1].strip() == str(len(lines) - 1):  # how many points there are, as .xyz files begin
         lines.pop(0)
     names: list[str] = []
-    if lines and not _is_number(_cells(lines[0][1])[0]):
+    if lines and not is_number(_cells(lines[0][1])[0]):
         names = [cell.strip('"').lower() for cell in _cells(_METRES.sub("", lines.pop(0)[1]))]
     if not lines:
         raise BadInput(f"{path}: {'holds column names alone' if names else 'is empty'}")
@@ -166,14 +167,6 @@ def _read_text(path: Path) -> tuple[list[str], list[tuple[int, str]]]:
 def _cells(line: str) -> list[str]:
     separator = next((mark for mark in ";," if mark in line), None)
     return [cell.strip() for cell in line.split(separator)]
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def _matrix_names(d: int) -> list[str]:

@@ -149,7 +149,7 @@ def _read_text(path: Path) -> Table:
         raise BadInput(f"{path}: is empty")
     first = lines[0]
     above = [remark for remark in remarks if remark[0] < first[0]]
-    header = above[-1][1] if above and _is_number(re.split(r"[;,\s]", first[1].strip())[0]) else lines.pop(0)[1]
+    header = above[-1][1] if above and is_number(re.split(r"[;,\s]", first[1].strip())[0]) else lines.pop(0)[1]
     header = _UNIT.sub(lambda found: f"[{found[1].replace(' ', '')}]", header)
     if not lines:
         raise BadInput(f"{path}: is empty, or holds column names alone")
@@ -179,7 +179,8 @@ def _name_and_unit(head: str) -> tuple[str, str]:
     return _UNIT.sub("", head).strip().lower(), unit[1] if unit else ""
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Whether a cell reads as a number."""
     try:
         float(cell)
     except ValueError:
