@@ -78,6 +78,8 @@ class Clouds:
         N = len(rows.stages[0].belief.log_weights)
         what = self._layout.stages[rows.name].get("belief.states", {})
         same, own = what.get("same_as"), _own(rows, what)[kept]
+        if same and "by" in self._layout.stages[same[0]].get("belief.states", {}):
+            own[:] = True  # those before stand, as drawn, in their parents' order
         columns = []
         if own.any():
             states = rows.array("belief.states")
