@@ -7,7 +7,7 @@ import pytest
 
 from viz_estim.core import kalman
 from viz_estim.core.beliefs import Gaussian, Particles
-from viz_estim.core.modes import moments
+from viz_estim.core.modes import moments, several
 from viz_estim.core.particle import ParticleFilter, equal, predict, resample, weigh
 from viz_estim.core.resampling import METHODS, Method
 from viz_estim.core.run import Scenario, Tick, run
@@ -240,7 +240,9 @@ def cloud(*parts: tuple[float, float, float, float], count: int = 1200, seed: in
 @pytest.mark.parametrize("count", [300, 1200, 100_000])
 @pytest.mark.parametrize("seed", range(3))
 def test_modes_that_stand_apart_are_found(count: int, seed: int) -> None:
-    found = cloud((0.6, 10, 1, 0.7), (0.3, 10, 9, 0.5), (0.1, 3, 4, 0.5), count=count, seed=seed).modes()
+    belief = cloud((0.6, 10, 1, 0.7), (0.3, 10, 9, 0.5), (0.1, 3, 4, 0.5), count=count, seed=seed)
+    found = belief.modes()
+    assert several(belief.space, belief.states, belief.log_weights)
     assert [mode.weight for mode in found] == pytest.approx([0.6, 0.3, 0.1], abs=3 / np.sqrt(count))
     for mode, (x, y, std) in zip(found, ((10, 1, 0.7), (10, 9, 0.5), (3, 4, 0.5)), strict=True):
         np.testing.assert_allclose(mode.mean[:2], [x, y], atol=6 * std / np.sqrt(count * mode.weight))
@@ -267,6 +269,7 @@ def test_one_mode_is_not_taken_for_several(seed: int) -> None:
     turned = equal(SO3(), SO3().plus(np.array([1.0, 0, 0, 0]), 0.3 * rng.standard_normal((500, 3))))
     for one in (uniform, blob, few, turned, equal(PLANAR, np.ones((50, 3))), equal(LINE, np.zeros((1, 1)))):
         assert [mode.weight for mode in one.modes()] == [pytest.approx(1, abs=0.05)]
+        assert not several(one.space, one.states, one.log_weights)
 
 
 def test_modes_of_what_has_no_metres() -> None:

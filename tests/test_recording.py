@@ -24,14 +24,16 @@ from viz_estim.core.unscented import predict, symmetric, update
 from viz_estim.parameters import parameters
 from viz_estim.recording.reader import Run
 from viz_estim.recording.recorder import Recorder
+from viz_estim.recording.schema import by_weight
 from viz_estim.running import find, plan
 from viz_estim.scenarios import SCENARIOS
 
 ODD, SHARED = "stages that differ from step to step", "two stages that share a sensor"
 STILL = "particles without a process, moved after some of their resamplings"
+TWICE = "particles weighed again after they were resampled"
 # What stands in a scene through all stages, by its place in the entity's path.
 STANDING = ("estimate", "truth", "scenery", "moved", "particles", "modes", "camera")
-every_scenario = pytest.mark.parametrize("name", [*SCENARIOS, ODD, SHARED, STILL])
+every_scenario = pytest.mark.parametrize("name", [*SCENARIOS, ODD, SHARED, STILL, TWICE])
 Kept = dict[str, tuple[Path, list[Step]]]
 
 
@@ -73,7 +75,12 @@ class Odd:
 @dataclasses.dataclass(frozen=True)
 class Still:
     """Particles that are weighed and resampled where they stood at the end of the step before; at every third step a
-    resampling moves its copies too."""
+    resampling moves its copies too.
+
+    again: the copies are weighed once more in the same step, where they were not moved.
+    """
+
+    again: bool = False
 
     def step(self, belief: Particles, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
         weighed = weigh(belief, lambda x, tick: -np.square(x[..., 0] - tick.measurements["z"][0]), tick)
@@ -83,13 +90,15 @@ class Still:
             moved = drawn.belief.states + 0.1 * rng.standard_normal(drawn.belief.states.shape)
             drawn = dataclasses.replace(drawn, belief=dataclasses.replace(drawn.belief, states=moved))
         yield drawn
+        if self.again:
+            yield weigh(drawn.belief, lambda x, tick: -np.abs(x[..., 1]), tick, name="weigh_again")
 
 
-def still() -> Scenario:
+def still(estimator: Still) -> Scenario:
     rng = np.random.default_rng(2)
     belief = equal(Product(position=Euclidean(("x", "y"), "m")), rng.standard_normal((50, 2)))
     ticks = [Tick(k / 10, 0.1, measurements={"z": rng.standard_normal(1)}) for k in range(40)]
-    return Scenario(Still(), {0: belief}, ticks)
+    return Scenario(estimator, {0: belief}, ticks)
 
 
 def made_up(estimator: Odd) -> Scenario:
@@ -101,8 +110,8 @@ def made_up(estimator: Odd) -> Scenario:
 
 def scenario(name: str) -> Scenario:
     """A scenario on short simulated data, whatever its data function can be told."""
-    if name == STILL:
-        return still()
+    if name in (STILL, TWICE):
+        return still(Still(again=name == TWICE))
     if name in (ODD, SHARED):
         return made_up(Odd(again=name == SHARED))
     source = find(name)
@@ -312,3 +321,44 @@ def owned(stage: Stage, before: Stage | None, drew: bool, index: int) -> set[str
 @every_scenario
 def test_geometry_stands_on_each_timeline_while_its_stage_does(recorded: tuple[Path, list[Step]]) -> None:
     assert_geometry(*recorded)
+
+
+def shown_clouds(path: Path) -> dict[int, set[tuple[Any, ...]]]:
+    """By stage, the places and colours of the particles that are to be seen: each component's latest row, and of those
+    with a radius."""
+    rows: dict[str, dict[int, Any]] = defaultdict(dict)
+    for chunk in RrdReader(path).stream():
+        if str(chunk.entity_path) == "/world/particles" and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            stages = batch.column("stage").cast(pa.int64()).to_pylist()
+            for name, column in zip(batch.schema.names, batch.columns, strict=True):
+                if ":" in name:
+                    values = zip(stages, column.to_pylist(), strict=True)
+                    rows[name.rpartition(":")[2]] |= {at: value for at, value in values if value is not None}
+    now: dict[str, Any] = {}
+    shown = {}
+    for at in sorted(set().union(*rows.values())):
+        now |= {name: found[at] for name, found in rows.items() if at in found}
+        places = now.get("positions") or now["origins"]
+        radii, colours = (now[name] * (1 if len(now[name]) > 1 else len(places)) for name in ("radii", "colors"))
+        seen = zip(map(tuple, places), radii, colours, strict=True)
+        shown[at] = {(*place, colour) for place, radius, colour in seen if radius}
+    return shown
+
+
+@pytest.mark.parametrize("name", [STILL, TWICE, "beacons-pf", "se2-pf"])
+def test_a_cloud_stands_at_each_stage_where_its_particles_do_in_their_weights_colours(
+    recorded: tuple[Path, list[Step]],
+) -> None:
+    path, steps = recorded
+    shown = shown_clouds(path)
+    at = 0
+    for step in steps:
+        for stage in step.stages:
+            belief = stage.belief
+            places = np.zeros((len(belief.states), 3), np.float32)
+            places[:, :2] = belief.states[:, :2]
+            weights = belief.log_weights.astype(np.float32)
+            colours = by_weight(np.exp(weights - weights.max()))
+            assert shown[at] == {(*map(float, p), int(c)) for p, c in zip(places, colours, strict=True)}, (at, stage)
+            at += 1

@@ -245,3 +245,12 @@ def test_slerp_agrees_with_scipy_s_whatever_the_signs() -> None:
     assert gap(SO3(), quaternions.slerp(times, stamps, q), found) < 1e-13
     oracle = Slerp(stamps, Rotation.from_quat(q, scalar_first=True))(times)
     assert gap(SO3(), found, oracle.as_quat(scalar_first=True)) < 1e-12
+
+
+@pytest.mark.parametrize("spread", [0.5, 3.0, 40.0])
+def test_many_angles_are_wrapped_as_each_alone(spread: float) -> None:
+    angles = np.random.default_rng(0).uniform(-spread, spread, 500)
+    angles[:6] = np.pi, -np.pi, np.nextafter(np.pi, 0), np.nextafter(-np.pi, -4), 0.0, np.nan
+    together = wrap(angles)
+    np.testing.assert_array_equal(together, [wrap(angle) for angle in angles])
+    np.testing.assert_allclose(np.exp(1j * together[:5]), np.exp(1j * angles[:5]))

@@ -49,11 +49,15 @@ class Categorical:
 
 @dataclass(frozen=True, slots=True)
 class Particles:
-    """N weighted points of a space: states (*, N, n); log_weights (*, N), whose exponentials sum to one."""
+    """N weighted points of a space: states (*, N, n); log_weights (*, N), whose exponentials sum to one.
+
+    copied: of which states (*, M, n) these are copies, and of which rows (*, N), where a resampling has said so.
+    """
 
     space: Space
     states: Array
     log_weights: Array
+    copied: tuple[Array, np.ndarray] | None = field(default=None, init=False, repr=False, compare=False)
     _moments: tuple[Array, Array] | None = field(default=None, init=False, repr=False, compare=False)
     _weights: Array | None = field(default=None, init=False, repr=False, compare=False)
     _ess: Array | None = field(default=None, init=False, repr=False, compare=False)
@@ -85,7 +89,9 @@ class Particles:
     def ess(self) -> Array:
         """The effective sample size 1/Σw² (*,), from 1 to N (Kong, Liu and Wong 1994)."""
         if self._ess is None:
-            object.__setattr__(self, "_ess", np.asarray(1 / np.vecdot(self.weights, self.weights)))
+            # Not by BLAS: for many particles it wakes a thread on each core, which then waits there in a busy loop.
+            squares = np.add.reduce(np.square(self.weights), axis=-1)
+            object.__setattr__(self, "_ess", np.asarray(1 / squares))
         assert self._ess is not None
         return self._ess
 

@@ -34,7 +34,7 @@ def moments(space: Space, states: Array, log_weights: Array) -> tuple[Array, Arr
     """
     # Each component in one piece: numpy is fast along long axes.
     states = np.moveaxis(np.ascontiguousarray(np.moveaxis(states, -1, 0)), 0, -1)
-    weights = np.exp(log_weights)[..., None]
+    weights = _weights(log_weights)[..., None]
     heaviest = log_weights.argmax(-1)[..., None, None]
     mean = np.take_along_axis(states, heaviest, axis=-2)
     settled = max(1e-10, 64 * np.finfo(float).eps * float(np.abs(states).max()))
@@ -49,6 +49,13 @@ def moments(space: Space, states: Array, log_weights: Array) -> tuple[Array, Arr
     return mean[..., 0, :], 0.5 * (cov + np.swapaxes(cov, -1, -2))
 
 
+def _weights(log_weights: Array) -> Array:
+    """Their exponentials; of one number spread over all particles, that one's."""
+    if log_weights.strides[-1] or log_weights.shape[-1] < 2:
+        return np.exp(log_weights)
+    return np.ascontiguousarray(np.broadcast_to(np.exp(log_weights[..., :1]), log_weights.shape))
+
+
 def modes(space: Space, states: Array, log_weights: Array, least: float = 0.05) -> tuple[Mode, ...]:
     """The modes of one cloud, states (N, n), that hold at least a share `least` of its weight; the heaviest first.
 
@@ -56,18 +63,29 @@ def modes(space: Space, states: Array, log_weights: Array, least: float = 0.05) 
     of either), a histogram smoothed with Silverman's width (1986, eq. 4.14): each cell climbs to its peak, and peaks
     without a valley between them are one mode. So are clouds that differ in heading alone.
     """
-    weights = np.exp(log_weights)
-    metres = [i for i, unit in enumerate(space.units) if unit == "m"]
-    points = states[:, metres] if metres else space.minus(states, moments(space, states, log_weights)[0])
-    cell, density = _histogram(points[:, :3], weights)
-    label = _basins(density)[cell]
-    share = np.bincount(label, weights)
+    label, share = _apart(space, states, log_weights)
     found = []
     for i in np.flatnonzero(share >= least):
         members = label == i
         mean, cov = moments(space, states[members], log_weights[members] - np.log(share[i]))
         found.append(Mode(float(share[i]), mean, cov))
     return tuple(sorted(found, key=lambda mode: -mode.weight))
+
+
+def several(space: Space, states: Array, log_weights: Array, least: float = 0.05) -> bool:
+    """Whether `modes` finds more than one: half the work, where most clouds have one."""
+    _, share = _apart(space, states, log_weights)
+    return int((share >= least).sum()) > 1
+
+
+def _apart(space: Space, states: Array, log_weights: Array) -> tuple[np.ndarray, Array]:
+    """The number of each particle's mode (N,), and their shares of the weight."""
+    weights = np.exp(log_weights)
+    metres = [i for i, unit in enumerate(space.units) if unit == "m"]
+    points = states[:, metres] if metres else space.minus(states, moments(space, states, log_weights)[0])
+    cell, density = _histogram(points[:, :3], weights)
+    label = _basins(density)[cell]
+    return label, np.bincount(label, weights).astype(float)
 
 
 def _histogram(points: Array, weights: Array) -> tuple[np.ndarray, Array]:
@@ -94,7 +112,10 @@ def _basins(density: Array) -> np.ndarray:
     while (peak != peak[peak]).any():
         peak = peak[peak]
     height = density.ravel()[peak].reshape(density.shape)
-    peaks, label = np.unique(peak, return_inverse=True)
+    peaks = np.flatnonzero(peak == np.arange(peak.size))
+    number = np.empty_like(peak)
+    number[peaks] = np.arange(len(peaks))
+    label = number[peak]
     basin = label.reshape(density.shape)
     joined = []
     for axis in range(density.ndim):

@@ -50,7 +50,8 @@ def weigh(belief: Particles, log_likelihood: LogLikelihood, tick: Tick, *, name:
     best = np.maximum.reduce(log_weights, axis=-1, keepdims=True)
     if not (best > LOG_ZERO / 2).all():  # nor NaN
         raise ArithmeticError("no particle has a likelihood above 0: none can give what was read")
-    weights = np.exp(log_weights - best)
+    weights = log_weights - best
+    np.exp(weights, out=weights)
     total = np.add.reduce(weights, axis=-1)
     evidence = best[..., 0] + np.log(total)
     log_weights -= evidence[..., None]
@@ -91,7 +92,9 @@ def resample(
     states = belief.states.reshape(-1, n).take(chosen, axis=0).reshape(belief.states.shape)
     ancestors = (chosen if copies.ndim == 1 else chosen % N).reshape(copies.shape)
     distinct = np.asarray(np.count_nonzero(copies, axis=-1 if copies.ndim > 1 else None), float)
-    return Resample(name, Particles(belief.space, states, log_weights), ancestors, distinct, belief.ess)
+    after = Particles(belief.space, states, log_weights)
+    object.__setattr__(after, "copied", (belief.states, ancestors))
+    return Resample(name, after, ancestors, distinct, belief.ess)
 
 
 @dataclass(frozen=True)

@@ -55,9 +55,11 @@ METHODS: dict[Method, Callable[[Array, np.random.Generator], np.ndarray]] = {
 
 def _scaled(weights: Array) -> Array:
     """N·cⱼ, whose last is N to the bit."""
-    c = np.cumsum(weights, axis=-1)
-    c /= c[..., -1:]
-    c *= weights.shape[-1]
+    N = weights.shape[-1]
+    c = np.add.accumulate(weights, axis=-1)
+    c *= N / c[..., -1:]
+    np.minimum(c, N, out=c)  # the product may be one bit above
+    c[..., -1] = N
     return c
 
 

@@ -150,9 +150,10 @@ def _finite(values: Array, before: Array) -> bool:
     """Whether all values are; those that the belief before held have been looked at."""
     if values is before:
         return True
-    # A finite sum of squares has finite terms, and is quicker to see; one that is not may have overflowed.
+    # A finite sum of squares has finite terms, and is quicker to see; one that is not may have overflowed. Not of many:
+    # BLAS then wakes a thread on each core, which waits there in a busy loop.
     flat = values.ravel()
-    return isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
+    return (flat.size <= 10_000 and isfinite(flat.dot(flat))) or bool(np.isfinite(flat).all())
 
 
 def _check_shapes(stage: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:

@@ -270,9 +270,8 @@ class Product:
         self.flat = all(part.flat for part in parts.values())
 
     def plus(self, x: Array, delta: Array) -> Array:
-        return np.concatenate(
-            [part.plus(x[..., self.at[k]], delta[..., self.axes_at[k]]) for k, part in self.parts.items()], axis=-1
-        )
+        moved = [part.plus(x[..., self.at[k]], delta[..., self.axes_at[k]]) for k, part in self.parts.items()]
+        return np.concatenate(moved, axis=-1)
 
     def minus(self, y: Array, x: Array) -> Array:
         return np.concatenate([part.minus(y[..., s], x[..., s]) for part, s in self._slices()], axis=-1)
@@ -293,8 +292,9 @@ class Product:
 
 
 def wrap(angle: Array) -> Array:
-    """The same angles in [−π, π). Where many are, that they are takes a tenth of the division to see."""
+    """The same angles in [−π, π). Of many, those that are already are seen in a tenth of the time of a division."""
     turned = angle + np.pi
-    if np.size(turned) > 100 and turned.min() >= 0 and turned.max() < 2 * np.pi:
-        return turned - np.pi
-    return turned % (2 * np.pi) - np.pi
+    if np.size(turned) <= 100:
+        return turned % (2 * np.pi) - np.pi
+    turned[(turned < 0) | (turned >= 2 * np.pi)] %= 2 * np.pi
+    return turned - np.pi

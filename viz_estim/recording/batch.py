@@ -96,24 +96,20 @@ class Batch:
 
     def __init__(self, steps: list[Step], first: int, before: Stage | None = None) -> None:
         self.steps = steps
-        codes: dict[tuple[str, ...], int] = {}
-        self.kind = np.array([codes.setdefault(_names(step.stages), len(codes)) for step in steps])
-        self.kinds = list(codes)
-        examples: dict[tuple[Any, ...], int] = {}
-        kinds = [examples.setdefault(_sensors(step.tick), len(examples)) for step in steps]
-        self.tick_kind = np.array(kinds)
-        self.ticks = [steps[kinds.index(code)].tick for code in range(len(examples))]
+        self._stages = list(map(_STAGES, steps))
+        self.kind, self.kinds, _ = _kinds([tuple(map(_NAME, stages)) for stages in self._stages])
+        ticks = list(map(_TICK, steps))
+        self.tick_kind, _, examples = _kinds(list(map(_sensors, ticks)))
+        self.ticks = [ticks[row] for row in examples]
         # A step without any stage (it failed at once) still takes a place on the stage timeline.
         counts = np.array([max(1, len(names)) for names in self.kinds])[self.kind]
         places = first + np.concatenate([[0], np.cumsum(counts)])
         self.end = int(places[-1])
-        self.times = Times(
-            np.array([step.index for step in steps]), np.array([step.tick.time for step in steps]), places[:-1]
-        )
+        self.times = Times(np.array(list(map(_INDEX, steps))), np.array(list(map(_TIME, ticks))), places[:-1])
         self._ended: list[Stage | None] = []  # by step, the stage that ended the step before
-        for step in steps:
+        for stages in self._stages:
             self._ended.append(before)
-            before = step.stages[-1] if step.stages else before
+            before = stages[-1] if stages else before
         self.last = before
         found: dict[str, list[tuple[np.ndarray, int, bool]]] = {}
         for code, names in enumerate(self.kinds):
@@ -134,10 +130,10 @@ class Batch:
         if len(groups) > 1:
             order = np.argsort(places)
             rows, offsets, last, places = rows[order], offsets[order], last[order], places[order]
-        steps, ended = self.steps, self._ended
+        of, ended = self._stages, self._ended
         pairs = list(zip(rows.tolist(), offsets.tolist(), strict=True))
-        stages = [steps[row].stages[i] for row, i in pairs]
-        before = [steps[row].stages[i - 1] if i else ended[row] for row, i in pairs]
+        stages = [of[row][i] for row, i in pairs]
+        before = [of[row][i - 1] if i else ended[row] for row, i in pairs]
         at = Times(self.times.step[rows], self.times.time[rows], places)
         return StageRows(name, stages, at, rows, offsets == 0, last, before)
 
@@ -176,12 +172,9 @@ class Batch:
         """Mean (N, n) and covariance (N, d, d) at the end of each step; of clouds, many at once."""
         ended = [self.steps[row].stages[-1].belief for row in self.end_rows.tolist()]
         if ended and isinstance(ended[0], Particles):
-            space, size = ended[0].space, max(1, 10_000 // len(ended[0].log_weights))
+            space, size = ended[0].space, max(1, 20_000 // len(ended[0].log_weights))
             groups = [ended[i : i + size] for i in range(0, len(ended), size)]
-            found = [
-                moments(space, np.stack([b.states for b in group]), np.stack([b.log_weights for b in group]))
-                for group in groups
-            ]
+            found = [moments(space, _states(group), _log_weights(group)) for group in groups]
             return np.concatenate([mean for mean, _ in found]), np.concatenate([cov for _, cov in found])
         return self.beliefs("mean")[self.ends], self.beliefs("cov")[self.ends]
 
@@ -193,6 +186,23 @@ class Batch:
         return np.array([nothing if step.truth is None else step.truth for step in self.steps])
 
 
+def _states(beliefs: list[Particles]) -> Array:
+    """Those of clouds of one size (M, N, n), with each component in one piece, as `moments` wants them."""
+    N, n = beliefs[0].states.shape
+    states = np.empty((n, len(beliefs), N))
+    for i, belief in enumerate(beliefs):
+        states[:, i] = belief.states.T
+    return np.moveaxis(states, 0, -1)
+
+
+def _log_weights(beliefs: list[Particles]) -> Array:
+    """Those of clouds of one size (M, N); one number spread over all, where all share an array of one number."""
+    first = beliefs[0].log_weights
+    if all(belief.log_weights is first for belief in beliefs) and (first == first[0]).all():
+        return np.broadcast_to(first[:1], (len(beliefs), len(first)))
+    return np.stack([belief.log_weights for belief in beliefs])
+
+
 _TIMELINES = ("step", "time", "stage")
 
 
@@ -202,15 +212,25 @@ def _copied(stage: Any, before: Any, name: str) -> bool:
     if before is None or before.name != name:
         return False
     states, ancestors = before.belief.states, stage.ancestors
+    said = stage.belief.copied
+    if said and said[0] is states and said[1] is ancestors:
+        return True
     within = len(ancestors) and ancestors.min() >= 0 and ancestors.max() < len(states)
     return bool(within) and np.array_equal(stage.belief.states, states.take(ancestors, axis=0))
 
 
-def _names(stages: tuple[Stage, ...]) -> tuple[str, ...]:
-    return tuple([stage.name for stage in stages])
+_STAGES, _NAME, _INDEX, _TICK, _TIME = map(attrgetter, ("stages", "name", "index", "tick", "time"))
+
+
+def _kinds(keys: list[Any]) -> tuple[np.ndarray, list[Any], list[int]]:
+    """The number of each key (N,) among the different ones, these, and the first row of each."""
+    kinds = list(dict.fromkeys(keys))
+    number = {kind: i for i, kind in enumerate(kinds)}
+    return np.array(list(map(number.__getitem__, keys))), kinds, list(map(keys.index, kinds))
 
 
 def _sensors(tick: Tick) -> tuple[Any, ...]:
     """What ticks have in common: which sensors they have readings of, and what is wrong with these."""
-    faults = (*tick.faults.items(), *tick.stand_ins) if tick.faults else ()
-    return (*tick.measurements, None, *tick.raw, None, *faults)
+    if tick.faults:
+        return (*tick.measurements, None, *tick.raw, None, *tick.faults.items(), *tick.stand_ins)
+    return (*tick.measurements, None, *tick.raw)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 from typing import Any
 
 import numpy as np
 import rerun as rr
 
 from viz_estim.core.beliefs import Particles
+from viz_estim.core.modes import several
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Step
 from viz_estim.core.spaces import SE2, SO2, SO3
@@ -20,7 +22,7 @@ from viz_estim.recording.columns import drawn, send, send_static
 from viz_estim.recording.layout import KEPT, Layout, place_of
 from viz_estim.recording.standing import Standing
 
-_LINES = 400  # of ancestry, at most
+_LINES = 250  # of ancestry, at most
 _LOOKS = 75  # how often in a run its modes are looked for: that takes longer than a step of a small filter
 
 
@@ -104,7 +106,7 @@ class Clouds:
         send(self._stream, self._path, at, columns)
 
     def _draw_descent(self, batch: Batch, rows: StageRows) -> None:
-        """Lines from parents, a step before, to their first children."""
+        """Lines from parents, a step before, to a child of each."""
         lines, drawn_rows = [], []
         for i, step in enumerate(rows.at.step.tolist()):
             before: Any = batch.ended(int(rows.rows[i]))
@@ -132,8 +134,8 @@ class Clouds:
         assert layout.position
         for i in chosen:
             step = batch.steps[batch.end_rows[i]]
-            modes = step.stages[-1].belief.modes()
-            found.append(modes if len(modes) > 1 else ())
+            belief: Any = step.stages[-1].belief
+            found.append(belief.modes() if several(belief.space, belief.states, belief.log_weights) else ())
         every = [mode for modes in found for mode in modes]
         at = batch.at.pick(batch.ends[chosen])
         axes = layout.space.axes_at[layout.position]
@@ -172,11 +174,13 @@ class Clouds:
 
 
 def _descent_of(stage: Any, before: Array) -> tuple[Array, Array]:
-    """Of a resampling, the states (L, n) of parents, a step before, and of their first children; `_LINES` at most."""
-    ancestors = stage.ancestors
-    first = np.concatenate([[0], 1 + np.flatnonzero(ancestors[1:] != ancestors[:-1])])  # copies stand together
-    chosen = first[:: max(1, -(-len(first) // _LINES))]
-    return before.take(ancestors[chosen], axis=0), stage.belief.states.take(chosen, axis=0)
+    """Of a resampling, the states (L, n) of parents, a step before, and of a child of each: of `_LINES` children at
+    most, as far apart in the cloud, so that a parent of many is hardly left out."""
+    children = _evenly(len(before), min(_LINES, len(before)))
+    parents = stage.ancestors[children]
+    first = np.ones(len(parents), bool)
+    np.not_equal(parents[1:], parents[:-1], out=first[1:])  # copies stand together
+    return before.take(parents[first], axis=0), stage.belief.states.take(children[first], axis=0)
 
 
 def _thinned(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
@@ -210,9 +214,10 @@ def _thinned(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
 _EQUAL = np.full(KEPT, -np.log(KEPT))
 
 
-def _evenly(count: int) -> np.ndarray:
-    """`KEPT` of so many places, all as far apart."""
-    return np.arange(KEPT) * count // KEPT
+@cache
+def _evenly(count: int, few: int = KEPT) -> np.ndarray:
+    """A few of so many places, all as far apart."""
+    return np.arange(few) * count // few
 
 
 def _equal(log_weights: Array) -> bool:

@@ -14,6 +14,8 @@ import rerun as rr
 
 from viz_estim.core.quaternions import Array
 
+_FEW = 16 << 10  # bytes
+
 
 @dataclass(frozen=True)
 class Times:
@@ -33,7 +35,7 @@ class Times:
     def columns(self) -> list[Column]:
         """All three, for a row that holds data."""
         nanoseconds = np.round(self.time * 1e9).astype("timedelta64[ns]")
-        return [place(self.step, "step"), Column("time", pa.array(nanoseconds)), place(self.stage)]
+        return [place(self.step, "step"), Column("time", _owned(nanoseconds)), place(self.stage)]
 
 
 class Column:
@@ -55,7 +57,20 @@ class Column:
 
 def place(values: np.ndarray, timeline: str = "stage") -> Column:
     """Places on a timeline that counts."""
-    return Column(timeline, pa.array(values.astype(np.int64, copy=False)))
+    return Column(timeline, _owned(values.astype(np.int64, copy=False)))
+
+
+def _owned(values: np.ndarray) -> pa.Array:
+    """Numbers (N,) as an arrow array; few of them in arrow's own memory.
+
+    What lies in numpy's is given back by the thread that wrote it, which has to wait for the interpreter's lock and
+    takes it from the filter: that costs more than to copy some kilobytes.
+    """
+    if values.nbytes > _FEW:
+        return pa.array(values)
+    memory = pa.allocate_buffer(values.nbytes)
+    np.frombuffer(memory, values.dtype)[:] = values
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, memory])
 
 
 @lru_cache(maxsize=256)
@@ -68,7 +83,7 @@ def _column(name: Any, values: pa.Array, counts: int | np.ndarray, rows: int) ->
     if isinstance(counts, int):
         offsets = _even(counts, rows)
     else:
-        offsets = pa.array(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32))
+        offsets = _owned(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32))
     return Column(name, pa.ListArray.from_arrays(offsets, values))
 
 
@@ -114,7 +129,7 @@ def numbers(archetype: str, component: str, rows: Array | list[Any], known: np.n
         present = [np.asarray(row, float).ravel() for row in rows if row is not None]
         flat = np.concatenate(present) if present else np.empty(0)
         counts = np.array([0 if row is None else np.size(row) for row in rows])
-    return _column(_named(archetype, component), pa.array(flat), counts, len(rows))
+    return _column(_named(archetype, component), _owned(flat), counts, len(rows))
 
 
 def indices(archetype: str, component: str, rows: list[Any]) -> Column:
@@ -122,7 +137,7 @@ def indices(archetype: str, component: str, rows: list[Any]) -> Column:
     present = [np.asarray(row, np.int32).ravel() for row in rows if row is not None]
     flat = np.concatenate(present) if present else np.empty(0, np.int32)
     counts = np.array([0 if row is None else np.size(row) for row in rows])
-    return _column(_named(archetype, component), pa.array(flat), counts, len(rows))
+    return _column(_named(archetype, component), _owned(flat), counts, len(rows))
 
 
 def once(archetype: str, component: str, value: Array, rows: int) -> Column:
@@ -130,7 +145,7 @@ def once(archetype: str, component: str, value: Array, rows: int) -> Column:
     flat = np.asarray(value, float).ravel()
     counts = np.zeros(rows, int)
     counts[0] = len(flat)
-    return _column(_named(archetype, component), pa.array(flat), counts, rows)
+    return _column(_named(archetype, component), _owned(flat), counts, rows)
 
 
 def words(archetype: Any, component: str, kinds: Sequence[str], which: np.ndarray) -> Column:
@@ -155,10 +170,10 @@ def drawn(archetype: Any, counts: int | np.ndarray, rows: int, **components: np.
     for name, values in components.items():
         descriptor, kind = _kind(archetype, name)
         if pa.types.is_fixed_size_list(kind):
-            flat = pa.array(np.asarray(values, np.float32).ravel())
+            flat = _owned(np.asarray(values, np.float32).ravel())
             batch = pa.FixedSizeListArray.from_arrays(flat, type=kind)
         else:
-            batch = pa.array(np.asarray(values, kind.to_pandas_dtype()).ravel())
+            batch = _owned(np.asarray(values, kind.to_pandas_dtype()).ravel())
         columns.append(_column(descriptor, batch, counts, rows))
     return columns
 

@@ -156,12 +156,10 @@ class Layout:
 
 def _silences(scenario: Scenario) -> dict[str, set[int]]:
     """By sensor, the steps before its first reading, and within a gap of more than five times its usual interval."""
-    together: dict[tuple[str, ...], list[int]] = {}
-    for k, tick in enumerate(scenario.ticks):
-        together.setdefault((*tick.measurements, *tick.raw), []).append(k)
+    together = [(*tick.measurements, *tick.raw) for tick in scenario.ticks]
     silent = {}
-    for sensor in dict.fromkeys(name for names in together for name in names):
-        came = np.sort(np.concatenate([steps for names, steps in together.items() if sensor in names]))
+    for sensor in dict.fromkeys(name for names in dict.fromkeys(together) for name in names):
+        came = np.flatnonzero([sensor in names for names in together])
         usual = float(np.median(np.diff(came))) if len(came) > 1 else 1.0
         ends = np.concatenate([[-1], came, [len(scenario.ticks)]])
         gaps = np.flatnonzero((np.diff(ends) > 5 * usual) | (ends[:-1] < 0))

@@ -104,14 +104,16 @@ class Recorder:
         with self._lock:
             if self._clouds:
                 step = self._clouds.take(step)
+            now = time.monotonic()
             if not self._rows:
-                self._oldest = time.monotonic()
+                self._oldest = now
             self._rows.append(step)
             if self._sized < 3:
                 self._sized += 1
                 few, most = (limit // max(1, _size(step)) for limit in _BYTES)
                 self._limit = max(1, min(self._limit, max(few, _ROWS[0]), most))
-            if len(self._rows) >= self._limit:
+            # By time here rather than by the timer, where steps are quick enough: two threads would hinder each other.
+            if len(self._rows) >= self._limit or now - self._oldest >= 0.9 * self._patience:
                 self._flush()
 
     def close(self, result: dict[str, Any] | None = None, *, facts: Mapping[str, float] | None = None) -> None:
