@@ -93,7 +93,7 @@ def split(K: Array, residual: Array, std: Array) -> tuple[Array, Array]:
 
 def transposed(a: Array) -> Array:
     """The matrices (*, n, m) of a (*, m, n)."""
-    return np.swapaxes(a, -1, -2)
+    return a.mT
 
 
 def symmetrised(a: Array) -> Array:
