@@ -100,6 +100,11 @@ def _why_nothing_draws() -> str | None:
     return None
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long tests begin first: begun last, one would keep a single worker busy when all others have ended."""
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Tests that draw are skipped where no graphics adapter is, but not in CI: there that is a failure."""
     draws = item.get_closest_marker("draws") is not None

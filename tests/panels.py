@@ -1,6 +1,5 @@
 """What the tests of pictures share: all views of a recording in one picture, and which of them shows nothing."""
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -9,15 +8,8 @@ from PIL import Image
 
 from viz_estim.recording.viewer import Viewer
 
-COLOURFUL = 20  # pixels that a line or a few points have at least; an empty view has axes and texts, all grey
+COLOURFUL = 12  # pixels that a line or a few points have at least; an empty view has axes and texts, all grey
 HEAD, FOOT, TITLE = 37, 28, 28  # what the viewer takes of a window above and below the views, and of each view
-
-
-def picture(viewer: Viewer, view_id: str | None = None) -> np.ndarray:
-    """A picture (height, width, 3) of a view without its heading, or of the whole viewer."""
-    png = viewer._client.take_screenshot(view_id)
-    pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
-    return pixels if view_id is None else pixels[TITLE:]
 
 
 def emptiness(view_class: str, pixels: np.ndarray) -> str:

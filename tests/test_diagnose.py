@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from batches import together
 from conftest import Cli, strict
 from rerun.chunk import RrdReader
 from scipy.stats import kstest
@@ -94,10 +95,14 @@ def next_of(filter: Any, space: Any, x: Array, tick: Tick, rng: np.random.Genera
 
 
 @functools.cache
-def healthy(name: str, seed: int) -> Run:
-    scenario = HEALTHY[name](np.random.default_rng(seed))
-    scenario = drawn(replace(scenario, ticks=scenario.ticks[: STEPS.get(name)]), np.random.default_rng(1000 + seed))
-    return collect(scenario, run(scenario, seed))
+def healthy(name: str) -> list[Run]:
+    """By seed."""
+    scenarios = []
+    for seed in range(SEEDS):
+        scenario = HEALTHY[name](np.random.default_rng(seed))
+        scenario = replace(scenario, ticks=scenario.ticks[: STEPS.get(name)])
+        scenarios.append(drawn(scenario, np.random.default_rng(1000 + seed)))
+    return [collect(*each) for each in zip(scenarios, together(scenarios, range(SEEDS)), strict=True)]
 
 
 def serious(findings: list[Finding]) -> list[Finding]:
@@ -106,7 +111,7 @@ def serious(findings: list[Finding]) -> list[Finding]:
 
 @pytest.mark.parametrize("name", HEALTHY)
 def test_data_of_the_filter_s_own_model_give_no_error_and_hardly_a_warning(name: str) -> None:
-    found = [finding for seed in range(SEEDS) for finding in serious(diagnose(healthy(name, seed)))]
+    found = [finding for run in healthy(name) for finding in serious(diagnose(run))]
     text = str(Counter((f.severity, f.code, f.sensor) for f in found))
     assert not [finding for finding in found if finding.severity == "error"], text
     assert len(found) <= SEEDS / 10, text
@@ -239,7 +244,7 @@ def test_a_lag_is_measured(delay: float) -> None:
 
 
 def test_fault_scores_are_standard_normal_without_a_fault() -> None:
-    runs = [evidence.case(healthy("landmarks-ekf", seed)) for seed in range(SEEDS)]
+    runs = list(map(evidence.case, healthy("landmarks-ekf")))
     scores = [fault.score for case in runs for fault in signatures.faults(case)]
     assert len(scores) == 3 * SEEDS  # two biases and a lag each
     assert kstest(scores, "norm").pvalue > 0.01

@@ -1,6 +1,5 @@
 """Expressions: one at a time and many at once they say the same, as Python would; what none may do is one line."""
 
-import time
 from typing import Any
 
 import numpy as np
@@ -197,9 +196,8 @@ def test_what_none_may_do_is_one_line(text: str) -> None:
 
 @pytest.mark.parametrize("text", ["9 ** 9 ** 9 ** 9 ** 9", "2 ** 1e300", "10 ** 10 ** 10 % 7", "cov @ cov @ cov @ cov"])
 def test_none_takes_long(text: str) -> None:
-    began = time.perf_counter()
-    value(text, frame())
-    assert time.perf_counter() - began < 0.5
+    """Numbers are of 64 bits: whole ones of Python's would grow until nothing else is done."""
+    assert np.asarray(value(text, frame())).dtype == np.float64
 
 
 def test_what_a_stage_lacks_never_holds() -> None:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import SHORT, Cli, strict
-from panels import assert_all_drawn, emptiness, picture
+from panels import assert_all_drawn, emptiness, side_by_side
+from PIL import Image
 
 import viz_estim
 from viz_estim.parameters import parameters
@@ -17,8 +18,9 @@ from viz_estim.scenarios import SCENARIOS
 pytestmark = pytest.mark.draws
 
 STEP = 300  # while it turns, and the gyro is alive
-SIZE = (1600, 1100)
-DURATIONS = ["data.duration=20", "data.steps=60", "data.points=1500", "particles=400", "by=imu-gyro"]
+SIZE = (1280, 880)
+WORLD_AND_SENSOR = ("/attitude", "/sensors/accel")  # where two views look
+BRIEF = [*SHORT, "data.steps=60", "data.points=1500", "particles=400", "by=imu-gyro"]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +42,7 @@ def test_every_scenario_has_its_view(name: str, viewer: Viewer, cli: Cli, tmp_pa
     source = find(name)
     assert source.data
     known = parameters(source.scenario) | {f"data.{k}": v for k, v in parameters(source.data).items()}
-    shorter = [f"--set={s}" for s in [*SHORT[1:], *DURATIONS] if s.partition("=")[0] in known]
+    shorter = [f"--set={s}" for s in BRIEF if s.partition("=")[0] in known]
     strict(cli("run", name, "--seed", 1, *shorter, "--out", tmp_path / "run.rrd", "--json"))
     # Half-way through, at a step that has all stages.
     run = viz_estim.load(tmp_path / "run.rrd")
@@ -53,20 +55,22 @@ def test_every_scenario_has_its_view(name: str, viewer: Viewer, cli: Cli, tmp_pa
 def test_a_stage_shows_its_own_sigma_points_and_no_other_s(viewer: Viewer, recording: Path, tmp_path: Path) -> None:
     run = viz_estim.load(recording)
     viewer.open(recording)
-    taken = []
-    world = next(v.view_id for v in viewer._client.get_state().views if v.origin == "/attitude")
-    sensor = next(v.view_id for v in viewer._client.get_state().views if v.origin == "/sensors/accel")
-    for table, row in run.at(STEP):
-        viewer.seek("stage", int(table.place[row]))
+    cells = side_by_side(viewer, SIZE)
+
+    def drawn(place: int) -> dict[str, np.ndarray]:
+        """By the view's name, its pixels at a stage."""
+        viewer.seek("stage", place)
         assert viewer.snapshot(tmp_path / "settled.png")
-        taken.append((table.name, picture(viewer, world), picture(viewer, sensor)))
-    assert [name for name, *_ in taken] == ["predict", "update"]
-    (_, world_before, sensor_before), (_, world_after, sensor_after) = taken
-    assert (np.abs(world_before - world_after).max(-1) > 20).sum() > 20  # points drawn from the belief, or propagated
-    assert emptiness("3D", sensor_before) == "0 pixels of any colour"
-    assert emptiness("3D", sensor_after) == ""
-    table, row = run.at(STEP)[0]
-    viewer.seek("stage", int(table.place[row]))
-    assert viewer.snapshot(tmp_path / "settled.png")
-    np.testing.assert_array_equal(picture(viewer, world), world_before)
-    np.testing.assert_array_equal(picture(viewer, sensor), sensor_before)
+        pixels = np.asarray(Image.open(tmp_path / "settled.png").convert("RGB")).astype(int)
+        return {name: pixels[rows, columns] for name, _, rows, columns in cells}
+
+    tables = run.at(STEP)
+    assert [table.name for table, _ in tables] == ["predict", "update"]
+    places = [int(table.place[row]) for table, row in tables]
+    before, after, again = drawn(places[0]), drawn(places[1]), drawn(places[0])
+    world, sensor = (next(v.name for v in viewer._client.get_state().views if v.origin == o) for o in WORLD_AND_SENSOR)
+    assert (np.abs(before[world] - after[world]).max(-1) > 20).sum() > 20  # points of the belief, or propagated
+    assert emptiness("3D", before[sensor]) == "0 pixels of any colour"
+    assert emptiness("3D", after[sensor]) == ""
+    np.testing.assert_array_equal(again[world], before[world])
+    np.testing.assert_array_equal(again[sensor], before[sensor])

@@ -18,6 +18,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from PIL import Image
 
+from viz_estim.recording import viewer as viewer_module
 from viz_estim.recording.viewer import Viewer, ViewerError, open_files, snapshot
 
 pytestmark = pytest.mark.draws
@@ -166,7 +167,10 @@ def test_a_live_run_is_followed(recording: Path) -> None:
         stream.disconnect()
 
 
-def test_files_that_are_no_recordings(viewer: Viewer, recording: Path, tmp_path: Path) -> None:
+def test_files_that_are_no_recordings(
+    viewer: Viewer, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(viewer_module, "LOAD_S", 3.0)  # a file without data is waited for as long as that
     (tmp_path / "cut.rrd").write_bytes(recording.read_bytes()[:3000])
     (tmp_path / "noise.rrd").write_bytes(np.random.default_rng(0).bytes(4000))
     for name, words in {"missing": "no such file", "cut": "has no data", "noise": "(Not an RRD file"}.items():

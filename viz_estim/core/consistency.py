@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from viz_estim.core import quaternions
 from viz_estim.core.discrete import categorical_metrics
+from viz_estim.core.distributions import chi2
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, SO3, Product, Space, wrap
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
+from viz_estim.core.distributions import chi2
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
 
@@ -93,7 +93,7 @@ def split(K: Array, residual: Array, std: Array) -> tuple[Array, Array]:
 
 def transposed(a: Array) -> Array:
     """The matrices (*, n, m) of a (*, m, n)."""
-    return np.swapaxes(a, -1, -2)
+    return a.mT
 
 
 def symmetrised(a: Array) -> Array:

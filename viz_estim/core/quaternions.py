@@ -52,7 +52,7 @@ def log(q: Array) -> Array:
 
 def length(v: Array) -> Array:
     """Euclidean length (*, 1) of vectors (*, n)."""
-    return np.sqrt(np.einsum("...i,...i->...", v, v))[..., None]
+    return np.sqrt(np.vecdot(v, v))[..., None]
 
 
 def normalise(q: Array) -> Array:
@@ -74,13 +74,12 @@ def cross(a: Array, b: Array) -> Array:
 
 def to_matrix(q: Array) -> Array:
     """Rotation matrices (*, 3, 3): world_R_body for world_q_body."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    r = np.empty((*q.shape[:-1], 3, 3))  # filled: stacking rows takes three times as long
+    r[..., 0, 0], r[..., 0, 1], r[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    r[..., 1, 0], r[..., 1, 1], r[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    r[..., 2, 0], r[..., 2, 1], r[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return r
 
 
 def from_matrix(r: Array) -> Array:

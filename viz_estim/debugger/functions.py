@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from viz_estim.core import quaternions
+from viz_estim.core.distributions import chi2
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import wrap
 

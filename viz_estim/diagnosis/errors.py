@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.stats import chi2
 
+from viz_estim.core.distributions import chi2
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import Finding, judge

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.stats import binom, f
 
+from viz_estim.core.distributions import binom, f
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import Finding, judge, level
 from viz_estim.recording.tables import StageTable

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from scipy.stats import binom, chi2, t
 
 from viz_estim.core.consistency import nees
+from viz_estim.core.distributions import binom, chi2, t
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
 from viz_estim.diagnosis.finding import Finding, judge, level

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2, t
 
+from viz_estim.core.distributions import chi2, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, wrap
 from viz_estim.diagnosis.axes import maps

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.stats import binom, chi2
 
 from viz_estim.core.consistency import squared_distance
+from viz_estim.core.distributions import binom, chi2
 from viz_estim.core.modes import modes, moments
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space

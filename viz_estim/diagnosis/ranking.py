@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from scipy.stats import chi2
-
+from viz_estim.core.distributions import chi2
 from viz_estim.diagnosis.finding import SYMPTOMS, Finding, Severity
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.stats import binom
 
+from viz_estim.core.distributions import binom
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.finding import Finding, judge
 from viz_estim.diagnosis.sensors import continuous, given, runs

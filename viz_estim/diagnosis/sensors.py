@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import binom, t
 
+from viz_estim.core.distributions import binom, t
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.finding import Finding, judge, level
 from viz_estim.recording.reader import Run

@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2, norm, t
 
+from viz_estim.core.distributions import chi2, norm, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
 from viz_estim.diagnosis.evidence import Case, jacobians, once, parameter, tells_gain, transitions

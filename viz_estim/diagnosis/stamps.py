@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.stats import norm
 
+from viz_estim.core.distributions import norm
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.finding import Finding, level
 from viz_estim.recording.reader import Run

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.stats import chi2
 
 from viz_estim.core.consistency import squared_distance
+from viz_estim.core.distributions import chi2
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.evidence import Case, jacobians, once, tells_gain, transitions

@@ -19,6 +19,7 @@ from viz_estim.recording import links
 from viz_estim.recording.rescue import whole
 
 START_S, SEEK_S, LOAD_S, LOAD_BYTES_PER_S = 30.0, 2.0, 10.0, 10e6  # the longest waits, for slow machines
+SETTLING_FRAMES = 8  # before a picture that may be the last one; most layouts are done after three
 
 # What it logs also pops up in the picture for seconds. Let through are the lines with its address, warnings and errors,
 # but not the warnings at its start, which are about the machine: no graphics card, a container.
@@ -161,11 +162,10 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
     def snapshot(self, path: str | Path, settle: float = 30.0) -> bool:
         """Writes the whole viewer as a PNG, whole or not at all; False if it still changed after `settle` seconds."""
         png, path, part = b"", Path(path), Path(f"{path}.{os.getpid()}.part")
-        equal = 0
-        for _ in _polls(settle):  # chunks load and plots lay out over several frames: some equal ones end it
+        for _ in _polls(settle):
+            self._pass_frames()
             before, png = png, self._ask(self._client.take_screenshot)
-            equal = equal + 1 if png == before and not self._state().loading else 0
-            if still := equal >= 3:
+            if still := png == before and not self._state().loading:
                 break
         try:
             part.write_bytes(png)
@@ -207,6 +207,15 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
 
     def _state(self) -> ViewerState:
         return self._ask(self._client.get_state)
+
+    def _pass_frames(self) -> None:
+        """Lets the viewer load chunks and lay out plots, which it does over several frames.
+
+        A frame that nobody takes a picture of is not rendered: without a graphics card that is a fiftieth of the work.
+        """
+        for _ in range(SETTLING_FRAMES):
+            self._state()
+            time.sleep(0.02)
 
     def _forget(self) -> None:
         self._seen = max((entry.sequence for entry in self._ask(self._client.get_logs)), default=0)

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
 
 from viz_estim.core.beliefs import Gaussian
 from viz_estim.core.consistency import rms, squared_distance
+from viz_estim.core.distributions import chi2
 from viz_estim.core.kalman import KalmanFilter, linear_sensor
 from viz_estim.core.measurement import transposed
 from viz_estim.core.quaternions import Array

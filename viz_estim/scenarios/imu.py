@@ -211,7 +211,9 @@ class GyroIntegrator:
 def _up_in_body(x: Array) -> Array:
     """The world's up (*, 3) in body axes, for states (*, n) that begin with a quaternion; also gravity's blind axis."""
     w, i, j, k = x[..., 0], x[..., 1], x[..., 2], x[..., 3]
-    return np.stack([2 * (i * k - w * j), 2 * (j * k + w * i), w * w - i * i - j * j + k * k], axis=-1)
+    up = np.empty((*x.shape[:-1], 3))
+    up[..., 0], up[..., 1], up[..., 2] = 2 * (i * k - w * j), 2 * (j * k + w * i), w * w - i * i - j * j + k * k
+    return up
 
 
 def _beliefs(data: ImuData, initial: Initial, make: Callable[[Array], Gaussian]) -> dict[int, Gaussian]:

@@ -50,8 +50,9 @@ class Imu:
 
     def noise(self, tick: Tick) -> Array:
         """Q (12, 12) of gyro, accelerometer and the walks of their biases over tick.dt."""
-        walks = tick.dt * self.gyro_bias_walk**2, tick.dt * self.accel_bias_walk**2
-        return np.diag(np.repeat([self.gyro_noise**2, self.accel_noise**2, *walks], 3))
+        white = [self.gyro_noise**2, self.accel_noise**2, 0.0, 0.0]
+        walks = [0.0, 0.0, self.gyro_bias_walk**2, self.accel_bias_walk**2]
+        return np.eye(12) * (np.repeat(white, 3) + tick.dt * np.repeat(walks, 3))
 
 
 class Model:
