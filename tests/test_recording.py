@@ -75,10 +75,7 @@ class Odd:
 @dataclasses.dataclass(frozen=True)
 class Still:
     """Particles that are weighed and resampled where they stood at the end of the step before; at every third step a
-    resampling moves its copies too.
-
-    again: the copies are weighed once more in the same step, where they were not moved.
-    """
+    resampling moves its copies too, or, `again`, none does and they are weighed once more in the same step."""
 
     again: bool = False
 
@@ -86,7 +83,7 @@ class Still:
         weighed = weigh(belief, lambda x, tick: -np.square(x[..., 0] - tick.measurements["z"][0]), tick)
         yield weighed
         drawn = resample(weighed.belief, rng)
-        if round(10 * tick.time) % 3 == 0:
+        if not self.again and round(10 * tick.time) % 3 == 0:
             moved = drawn.belief.states + 0.1 * rng.standard_normal(drawn.belief.states.shape)
             drawn = dataclasses.replace(drawn, belief=dataclasses.replace(drawn.belief, states=moved))
         yield drawn
