@@ -49,15 +49,11 @@ class Categorical:
 
 @dataclass(frozen=True, slots=True)
 class Particles:
-    """N weighted points of a space: states (*, N, n); log_weights (*, N), whose exponentials sum to one.
-
-    copied: of which states (*, M, n) these are copies, and of which rows (*, N), where a resampling has said so.
-    """
+    """N weighted points of a space: states (*, N, n); log_weights (*, N), whose exponentials sum to one."""
 
     space: Space
     states: Array
     log_weights: Array
-    copied: tuple[Array, np.ndarray] | None = field(default=None, init=False, repr=False, compare=False)
     _moments: tuple[Array, Array] | None = field(default=None, init=False, repr=False, compare=False)
     _weights: Array | None = field(default=None, init=False, repr=False, compare=False)
     _ess: Array | None = field(default=None, init=False, repr=False, compare=False)

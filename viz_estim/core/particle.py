@@ -56,7 +56,7 @@ def weigh(belief: Particles, log_likelihood: LogLikelihood, tick: Tick, *, name:
     evidence = best[..., 0] + np.log(total)
     log_weights -= evidence[..., None]
     after = Particles(belief.space, belief.states, log_weights)
-    weights /= total[..., None]
+    weights *= 1 / total[..., None]
     object.__setattr__(after, "_weights", weights)  # so that a resampling need not take exponentials again
     return Weigh(name, after, log_likelihoods, np.asarray(evidence), after.ess)
 
@@ -92,9 +92,7 @@ def resample(
     states = belief.states.reshape(-1, n).take(chosen, axis=0).reshape(belief.states.shape)
     ancestors = (chosen if copies.ndim == 1 else chosen % N).reshape(copies.shape)
     distinct = np.asarray(np.count_nonzero(copies, axis=-1 if copies.ndim > 1 else None), float)
-    after = Particles(belief.space, states, log_weights)
-    object.__setattr__(after, "copied", (belief.states, ancestors))
-    return Resample(name, after, ancestors, distinct, belief.ess)
+    return Resample(name, Particles(belief.space, states, log_weights), ancestors, distinct, belief.ess)
 
 
 @dataclass(frozen=True)

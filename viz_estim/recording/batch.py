@@ -212,11 +212,10 @@ def _copied(stage: Any, before: Any, name: str) -> bool:
     if before is None or before.name != name:
         return False
     states, ancestors = before.belief.states, stage.ancestors
-    said = stage.belief.copied
-    if said and said[0] is states and said[1] is ancestors:
-        return True
-    within = len(ancestors) and ancestors.min() >= 0 and ancestors.max() < len(states)
-    return bool(within) and np.array_equal(stage.belief.states, states.take(ancestors, axis=0))
+    try:
+        return np.array_equal(stage.belief.states, states.take(ancestors, axis=0))
+    except IndexError:  # a person's own ancestors may name none of them
+        return False
 
 
 _STAGES, _NAME, _INDEX, _TICK, _TIME = map(attrgetter, ("stages", "name", "index", "tick", "time"))
