@@ -186,10 +186,15 @@ def send(stream: rr.RecordingStream, path: str, at: Times, columns: Iterable[Any
 def send_static(stream: rr.RecordingStream, path: str, archetype: Any) -> None:
     """What `stream.log(path, archetype, static=True)` does, at once: a log waits in the stream's own batches, and comes
     out among the columns in another order each time."""
-    batches = archetype.as_component_batches()
-    columns = [
-        rr.ComponentColumn(b.component_descriptor(), b, lengths=[len(b.as_arrow_array())])
-        for b in batches
-        if b.as_arrow_array() is not None
-    ]
+    send_still(stream, path, still(archetype))
+
+
+def still(archetype: Any) -> list[Column]:
+    """An archetype's components as columns of one row, which may be sent many times."""
+    batches = [(b.component_descriptor(), b.as_arrow_array()) for b in archetype.as_component_batches()]
+    return [_column(name, values, len(values), 1) for name, values in batches if values is not None]
+
+
+def send_still(stream: rr.RecordingStream, path: str, columns: Iterable[Any]) -> None:
+    """Columns without a time."""
     rr.send_columns(path, [], columns, recording=stream, strict=True)

@@ -9,7 +9,7 @@ import rerun as rr
 
 from viz_estim.core.quaternions import Array
 from viz_estim.recording import schema
-from viz_estim.recording.columns import Times, drawn, send, send_static
+from viz_estim.recording.columns import Column, Times, drawn, send, send_still, still
 
 Series = tuple[str, schema.Colour, Array]  # name, colour, values (N,)
 
@@ -63,14 +63,14 @@ class Lines:
         if path not in self._styled:
             self._styled.add(path)
             names, colours, _ = zip(*series, strict=True)
-            send_static(self._stream, path, _style(names, colours, unit))
+            send_still(self._stream, path, _style(names, colours, unit))
 
 
 @cache
-def _style(names: tuple[str, ...], colours: tuple[schema.Colour, ...], unit: str) -> rr.Measurements:
+def _style(names: tuple[str, ...], colours: tuple[schema.Colour, ...], unit: str) -> list[Column]:
     """Made once for all plots that look alike: it takes longer than a hundred rows."""
-    return rr.Measurements.from_fields(
-        names=names, colors=colours, units=[unit] * len(names), aggregation_policy="MinMax"
+    return still(
+        rr.Measurements.from_fields(names=names, colors=colours, units=[unit] * len(names), aggregation_policy="MinMax")
     )
 
 
