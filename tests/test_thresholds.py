@@ -16,7 +16,7 @@ from viz_estim.diagnosis import confidence, evidence, gates, innovations, models
 from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
 from viz_estim.recording.memory import collect
 from viz_estim.recording.reader import Run
-from viz_estim.scenarios import flawed_data, landmarks, scan
+from viz_estim.scenarios import diffdrive, flawed_data, imu, landmarks, scan
 
 
 @functools.cache
@@ -162,3 +162,30 @@ def test_a_registration_that_settles_in_a_wrong_place_is_told() -> None:
     found = diagnose(collect(beside, run(beside)))
     assert ("diverged", "error") in severities(found), found
     assert "local minimum" in next(f for f in found if f.code == "diverged").cause
+
+
+def imu_run(change: Any, duration: float) -> list[Finding]:
+    data = imu.imu(None, np.random.default_rng(6), duration=duration, freeze=0.0)
+    scenario = imu.imu_ukf_gyro(replace(data, gyro=change(data.gyro)))
+    return diagnose(collect(scenario, run(scenario)))
+
+
+def test_a_gyro_s_sensitivity_is_told_by_how_gravity_turns() -> None:
+    first = imu_run(lambda rate: 1.25 * rate, 24.0)[0]
+    assert (first.code, first.sensor, first.severity) == ("units_or_axes", "gyro", "error")
+    assert float(first.evidence["map"].removeprefix("a factor of ")) == pytest.approx(1.25, abs=0.06)
+
+
+def test_a_rate_that_gravity_belies_is_a_bias_and_no_slow_turn() -> None:
+    first = imu_run(lambda rate: rate + np.array([0.0, 0.08, 0.03]), 6.0)[0]
+    assert (first.code, first.sensor, first.severity) == ("biased_innovation", "gyro", "error")
+    assert first.evidence["bias"] == pytest.approx(0.08, abs=0.01)
+
+
+def test_a_wrong_sign_in_the_transition_is_told_where_the_control_is_recorded() -> None:
+    scenario = diffdrive.diffdrive_ekf(diffdrive.diffdrive(None, np.random.default_rng(5)))
+    filter: Any = scenario.estimator
+    sign = np.array([[1, 1, -1], [1, 1, 1], [1, 1, 1]])
+    wrong = replace(filter, jacobian=lambda x, tick: sign * filter.jacobian(x, tick))
+    first = diagnose(collect(scenario, run(replace(scenario, estimator=wrong))))[0]
+    assert (first.code, first.severity) == ("jacobian", "error")

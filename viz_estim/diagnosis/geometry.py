@@ -12,7 +12,7 @@ from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.covariance import epsilon
 from viz_estim.diagnosis.evidence import Case, tells_reading
 from viz_estim.diagnosis.finding import Finding, level
-from viz_estim.diagnosis.kinematics import imu_axes
+from viz_estim.diagnosis.kinematics import imu_axes, scale
 from viz_estim.recording.layout import leaves
 
 _BURST, _BESIDE = 100.0, 0.3  # of the usual S; rad from ±π
@@ -88,7 +88,7 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
     inequality on a likelihood ratio; Ville 1939).
     """
     told = set()
-    for finding in imu_axes(case):
+    for finding in list(imu_axes(case)) or list(scale(case)):
         told.add(finding.sensor)
         yield finding
     for name, readings in case.sensors.items():

@@ -16,7 +16,7 @@ _HALF = 0.5  # of the cloud's points: the breakdown point, beyond which no estim
 
 def is_registration(case: Case) -> bool:
     """Whether a step of the run is an iteration towards one estimate, and not an estimate of its own."""
-    return _fits(case) is not None
+    return any("matches.distance" in t.values for t in case.run.stages.values()) or _fits(case) is not None
 
 
 def _fits(case: Case) -> StageTable | None:
@@ -89,9 +89,10 @@ def few_matches(case: Case) -> Iterator[Finding]:
         steps = int(matched.step[0]), int(matched.step[-1])
         yield Finding(
             "icp_few_matches", severity or "error", None, steps, {"matches": count, "points": N},
-            f"only {count} of {N} points have a match at the end: the clouds hardly overlap, or max_distance is too "
-            "small for the way that was to go",
-            "raise max_distance (start with the distance that the clouds are apart), or start nearer",
+            f"{f'only {count} of {N} points have' if count else 'no point has'} a match at the end: the clouds hardly "
+            "overlap, are in another unit, or max_distance is too small for the way that was to go",
+            "check that both clouds are in metres; raise max_distance (start with the distance that they are apart), "
+            "or start nearer",
         )  # fmt: skip
 
 

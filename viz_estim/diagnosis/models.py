@@ -111,6 +111,7 @@ def predicted(case: Case) -> Iterator[Finding]:
         white = np.einsum("mij,mi->mj", vectors, rest) / np.sqrt(np.where(held, values, np.inf))
         ratio = float(np.median((white**2).sum(1) / np.maximum(held.sum(1), 1)))
         drift = _follows(rest, moved)
+        told = "control" in run.inputs  # else the prediction may follow what the recording does not hold
         largest = float(np.abs(table.mean).max())
         left, count = _left(change - moved, expected - moved, may, largest)
         size = np.median(np.linalg.norm(rest, axis=1))
@@ -122,7 +123,7 @@ def predicted(case: Case) -> Iterator[Finding]:
                 "of the process noise is added to it",
                 "predict the mean by the model alone; the noise enters the covariance, as + Q",
             )  # fmt: skip
-        elif drift > _HALF and (severity := _severity(left, count * change.shape[1])):
+        elif (drift > _HALF or (told and ratio <= _UNFELT)) and (severity := _severity(left, count * change.shape[1])):
             yield _wrong("F", severity, None, steps, left, "the process model f(x)")
 
 

@@ -144,6 +144,8 @@ def _moves_as(
         sign = (
             "its sign is wrong"
             if abs(factor + 1) < 0.2
+            else "a dt that is multiplied once too often"
+            if abs(factor / float(np.median(dt)) - 1) < 0.1
             else named(factor, unit)
             if factor > 0
             else "a wrong sign and size"

@@ -60,7 +60,7 @@ def sensors(case: Case) -> Iterator[Finding]:
         causes = [c for c in (*_maps(one), _bias(one), _lag(case, one)) if c is not None]
         found = [(c, judge(c.p, tests, large=c.large)) for c in causes]
         slip = 2 * float(np.median(one.slip))
-        found = [(c, s) for c, s in found if s and (c.size > max(slip, _SMALL) or (c.explained > SURELY and c.known))]
+        found = [(c, s) for c, s in found if s and c.size > max(slip, _SMALL)]
         if not found or name in told:
             continue
         best, severity = max(found, key=lambda entry: entry[0].gain - 0.5 * entry[0].k * np.log(len(one.step)))
@@ -179,6 +179,9 @@ def _lag(case: Case, one: Against) -> Cause | None:
     if abs(tau) < 0.5 * interval:
         return None
     late = "late" if tau > 0 else "early"
+    place = set(one.space.axis_units) == {"m"} and len(one.space.axes) > 1
+    where = "behind" if tau > 0 else "ahead of"
+    alike = f"; or it sits {where} what moves, which looks alike at one speed" if place else ""
     readings = float(np.median(np.diff(one.time)))
     if abs(tau) > 0.1 * (one.time[-1] - one.time[0]):
         return None  # so long a lag is no matter of a rate
@@ -186,7 +189,7 @@ def _lag(case: Case, one: Against) -> Cause | None:
         "lag", alone.gain, 1, p, fit.p_beyond(0, 0.5 * interval), shift, alone.explained,
         {"lag_s": tau, "lag_samples": tau / readings},
         f"against the truth, readings of {one.name} come {abs(tau):.3g} s {late} ({abs(tau) / readings:.1f} of its "
-        "samples): a delay of the sensor or of the truth, another clock, or an index that is one off",
+        f"samples): a delay of the sensor or of the truth, another clock, or an index that is one off{alike}",
         f"pair {one.name} by its stamps and not by index; correct its stamps by {-tau:+.3g} s",
     )  # fmt: skip
 
@@ -227,6 +230,8 @@ def _maps(one: Against) -> Iterator[Cause]:
 
 def named(factor: float, unit: str) -> str:
     """What a factor of a reading may come from."""
+    if abs(factor / 2 - 1) < _NEAR:
+        return "twice, as a round trip taken for the way there"
     known = [title for title, value in units(unit).items() if abs(factor * value - 1) < _NEAR]
     if known:
         return known[0]
