@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from viz_estim.core.modes import modes
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import run
 from viz_estim.core.spaces import Euclidean
@@ -189,3 +190,10 @@ def test_a_wrong_sign_in_the_transition_is_told_where_the_control_is_recorded() 
     wrong = replace(filter, jacobian=lambda x, tick: sign * filter.jacobian(x, tick))
     first = diagnose(collect(scenario, run(replace(scenario, estimator=wrong))))[0]
     assert (first.code, first.severity) == ("jacobian", "error")
+
+
+@pytest.mark.parametrize("N", [200, 1000])
+def test_a_normal_cloud_has_one_mode(N: int) -> None:
+    plane = Euclidean(("x", "y"), "m")
+    clouds = (np.random.default_rng(seed).standard_normal((N, 2)) for seed in range(200))
+    assert all(len(modes(plane, cloud, np.full(N, -np.log(N)))) == 1 for cloud in clouds)

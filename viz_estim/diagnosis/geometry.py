@@ -68,9 +68,9 @@ def quaternion_norms(case: Case) -> Iterator[Finding]:
                 "average attitudes on the manifold (SO3().mean), and move them by SO3().plus",
             )  # fmt: skip
         q = run.mean[:, at]
-        flips = np.flatnonzero(((q[1:] * q[:-1]).sum(1) < -0.5) & (run.step[1:] > case.first)) + 1
+        flips = np.flatnonzero(((q[1:] * q[:-1]).sum(1) < 0) & (run.step[1:] > case.first)) + 1
         turned = np.linalg.norm(SO3().minus(q[1:], q[:-1]), axis=1)
-        flips = flips[turned[flips - 1] < 1.0]
+        flips = flips[turned[flips - 1] < np.pi / 2]  # by a half turn either sign is as near
         if len(flips) > 1 and len(flips) > len(q) / 200:
             yield Finding(
                 "angle_wrap", "warning", None, (int(run.step[flips[0]]), int(run.step[flips[-1]])),
