@@ -20,7 +20,8 @@ CASES: dict[str, tuple[str, tuple[Any, ...]]] = {
     "chi2.median": ("median", (DOF,)),
     "norm.sf": ("sf", (np.concatenate([X, -X]),)),
     "t.sf": ("sf", (np.concatenate([X, -X]), DOF)),
-    "f.isf": ("isf", (P[1:], DOF[1:], DOF[1:])),
+    "f.sf": ("sf", (X, DOF[1:], DOF[::-1][:-1])),
+    "f.isf": ("isf", (P[1:], DOF[1:], DOF[::-1][:-1])),  # scipy's own is right to eight digits at 1e-9
     "binom.cdf": ("cdf", (np.arange(-1, 302), TRIALS, 0.3)),
     "binom.sf": ("sf", (np.arange(-1, 302), TRIALS, 0.3)),
 }
@@ -34,3 +35,8 @@ def test_it_is_scipy_s(name: str) -> None:
     np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-300)
     one = getattr(getattr(distributions, kind), method)(*(np.ravel(a)[-1] for a in arguments))
     assert np.ndim(one) == 0
+
+
+def test_far_in_the_tail_of_f_the_inverse_is_one() -> None:
+    p, k, m = np.array([1e-300, 1e-12, 1e-9]), DOF[1:], DOF[::-1][:-1]
+    np.testing.assert_allclose(distributions.f.sf(distributions.f.isf(p, k, m), k, m), p * np.ones_like(k), rtol=1e-9)

@@ -1,6 +1,7 @@
 """The house's rule: who may import what, read from the modules' text; and no module grows beyond 300 lines."""
 
 import ast
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -88,3 +89,10 @@ def test_the_rule_sees_imports_of_every_form(monkeypatch: pytest.MonkeyPatch, tm
     monkeypatch.setitem(MODULES, "viz_estim/core/one", tmp_path / "one.py")
     assert sorted(imports("viz_estim/core/one")) == ["a.b", "d.e", "j", "k", "viz_estim.core.f", "viz_estim.g.h"]
     assert foreign("viz_estim/core/one", "a", "d.e", "viz_estim.core") == ["viz_estim.g.h", "j", "k"]
+
+
+def test_the_command_line_starts_without_scipy_stats() -> None:
+    """Importing it takes longer than all else together."""
+    loaded = "import sys, viz_estim.cli; print('scipy.stats' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"

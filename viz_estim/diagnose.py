@@ -12,6 +12,7 @@ from viz_estim.diagnosis import (
     confidence,
     covariance,
     errors,
+    gates,
     geometry,
     icp,
     innovations,
@@ -44,7 +45,7 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     innovations.biased,
     innovations.coloured,
     innovations.outliers,
-    innovations.gates,
+    gates.gates,
     innovations.diverged,
     innovations.lost,
     signatures.lags,
@@ -68,6 +69,7 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     icp.not_converged,
     icp.few_matches,
     icp.rising,
+    icp.settled,
 )
 
 
@@ -88,7 +90,8 @@ def diagnose(run: Run) -> list[Finding]:
         under_test = case(run, faulty)
         for check in OF_FILTERS:
             found += check(under_test)
-        if any(f.severity != "note" and (f.code in SYMPTOMS or f.code == "biased_innovation") for f in found):
+        odd = (*SYMPTOMS, "biased_innovation", "particles_far", "particles_collapsed")
+        if any(f.severity != "note" and f.code in odd for f in found):
             found += motion.prediction(under_test)  # else the filter knows how wrong it is
         # Noises are tuned once nothing else is wrong: until then a factor on them would only hide it.
         causes = [f for f in ranked(found) if f.severity == "error" and f.tier <= _TIMES and f.code != "start"]

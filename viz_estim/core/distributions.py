@@ -55,8 +55,12 @@ class f:
     """Fisher's F with k and m degrees of freedom."""
 
     @staticmethod
+    def sf(x: Any, k: Any, m: Any) -> Any:
+        return special.fdtrc(_positive(k), _positive(m), np.maximum(x, 0.0))
+
+    @staticmethod
     def isf(p: Any, k: Any, m: Any) -> Any:
-        return special.fdtri(_positive(k), _positive(m), 1.0 - np.asarray(p, float))
+        return 1 / special.fdtri(_positive(m), _positive(k), p)  # the inverse has m and k; 1 − p would be 1 for small p
 
 
 class binom:

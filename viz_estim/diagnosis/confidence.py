@@ -15,9 +15,11 @@ from viz_estim.core.distributions import chi2, norm
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis import tuning
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import Finding, judge
+from viz_estim.diagnosis.finding import GROSS, Finding, judge
 
-_GROSS = 2.0  # a covariance too small by this factor is an error, by less a warning; too large is never one
+# A covariance too small by GROSS is an error, by less a warning; too large is never one: it costs, and misleads nobody.
+# S goes as the root of Q, as that of a random walk does in its steady state, P ≈ √(Q·R): Q may be wrong by its square.
+_GROSS_Q = GROSS**2
 _FEWEST = 10
 _STUCK, _BEYOND = 0.9, 10.0  # so alike and so large that no noise would make them
 _TAIL, _MANY = 1e-3, 0.05
@@ -31,7 +33,7 @@ def by_sensor(case: Case) -> Iterator[Finding]:
         N, dof = len(readings), readings.dof
         if N < _FEWEST:
             continue
-        ratio, p = size(readings.nis, dof)
+        ratio, p, p_gross = size(readings.nis, dof)
         if judge(p, 2 * len(case.sensors), large=False) is None:
             continue
         over = ratio > 1
@@ -47,7 +49,9 @@ def by_sensor(case: Case) -> Iterator[Finding]:
             if tuned["Q"].gain > tuned[name].gain and (tuned["Q"].factor > 1) == over and tuned["Q"].known:
                 process = tuned["Q"].factor
         evidence["autocorrelation"] = rho
-        severity = judge(p, 2 * len(case.sensors), large=ratio > _GROSS or (process or 0) > _GROSS**2)
+        if process is not None:
+            p_gross = min(p_gross, tuned["Q"].p_beyond(_GROSS_Q))
+        severity = judge(p, 2 * len(case.sensors), large=p_gross)
         assert severity
         spoken = spoken or process is not None or (rho > _STUCK and ratio > _BEYOND)
         code = "overconfident" if over else "underconfident"
@@ -69,11 +73,11 @@ def _by_process(case: Case) -> Iterator[Finding]:
     tuned = tuning.factors(case)
     if "Q" not in tuned or any(tuned[name].gain > tuned["Q"].gain for name in tuned):
         return
-    factor, gain = tuned["Q"]
+    factor, gain = tuned["Q"].factor, tuned["Q"].gain
     if not tuned["Q"].known:
         return
     p, over = float(chi2.sf(2 * gain, 1)), factor > 1
-    severity = judge(p, 1, large=factor > _GROSS**2)
+    severity = judge(p, 1, large=tuned["Q"].p_beyond(_GROSS_Q))
     if severity:
         yield Finding(
             "overconfident" if over else "underconfident", severity, None, case.whole,
@@ -100,8 +104,9 @@ def ljung_box(readings: Readings, lags: int = 10) -> float:
     return float(chi2.sf(Q, rho.size))
 
 
-def size(nis: Array, dof: int) -> tuple[float, float]:
-    """How large NIS are, as a multiple of what they should be, and the chance of that.
+def size(nis: Array, dof: int) -> tuple[float, float, float]:
+    """How large NIS are, as a multiple of what they should be; the chance of that; and that of as much or more if S is
+    too small by GROSS.
 
     Without those beyond the χ² quantile of 1 − 10⁻³, which are a matter of outliers, as long as these are few: the mean
     of χ²(dof) below c is dof·F(c; dof + 2)/F(c; dof), its second moment dof·(dof + 2)·F(c; dof + 4)/F(c; dof).
@@ -109,12 +114,14 @@ def size(nis: Array, dof: int) -> tuple[float, float]:
     c, far = chi2.isf(_TAIL, dof), _far(nis, dof)
     if not far.any():
         total, n = float(nis.sum()), len(nis) * dof
-        return total / n, float(2 * min(chi2.sf(total, n), chi2.cdf(total, n)))
+        p = 2 * min(chi2.sf(total, n), chi2.cdf(total, n))
+        return total / n, float(p), float(chi2.sf(total / GROSS, n))
     held = chi2.cdf(c, dof)
     mean = dof * chi2.cdf(c, dof + 2) / held
     variance = dof * (dof + 2) * chi2.cdf(c, dof + 4) / held - mean**2
-    found = float(nis[~far].mean())
-    return found / mean, float(2 * norm.sf(abs(found - mean) / np.sqrt(variance / (~far).sum())))
+    found, error = float(nis[~far].mean()), float(np.sqrt(variance / (~far).sum()))
+    p_gross = norm.sf((found / GROSS - mean) / error)
+    return found / mean, float(2 * norm.sf(abs(found - mean) / error)), float(p_gross)
 
 
 def _far(nis: Array, dof: int) -> np.ndarray:

@@ -11,20 +11,24 @@ import numpy as np
 
 from viz_estim.core.distributions import chi2
 from viz_estim.core.quaternions import Array
+from viz_estim.diagnosis import clouds, motion
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import Finding, judge
+from viz_estim.diagnosis.finding import GROSS, Finding, judge
+from viz_estim.diagnosis.icp import is_registration
 
-_GROSS = 2.0  # errors as large as this multiple of their covariance's are an error
 _FEWEST = 10
 
 
 def start(case: Case) -> Iterator[Finding]:
-    """The error of the first belief against its covariance: eᵀ·P⁻¹·e is χ² of as many components as have a truth."""
+    """The error of the first belief against its covariance: eᵀ·P⁻¹·e is χ² of as many components as have a truth.
+
+    It is one error and no estimate of how large errors are: large is one that is larger than GROSS allows.
+    """
     run = case.run
     if run.labels or run.properties.get("belief") == "Particles" or not {"mean", "cov"} <= run.ends.keys():
         return
-    if any("rmse" in table.values for table in run.stages.values()):
-        return  # a registration starts where it is told to, and says so by no covariance
+    if is_registration(case):
+        return  # it starts where it is told to, and says so by no covariance
     table = run.stages.get("start")
     known_at = np.flatnonzero((run.step >= case.first) & np.isfinite(run.truth).any(1) & np.isfinite(run.mean).all(1))
     if not len(known_at) or known_at[0] > run.row(step=case.whole[0]) + 0.05 * len(run.step):
@@ -38,7 +42,7 @@ def start(case: Case) -> Iterator[Finding]:
     if not known.any() or np.linalg.cond(P[known][:, known]) > 1e13:
         return
     value, dof = float(error[known] @ np.linalg.solve(P[known][:, known], error[known])), int(known.sum())
-    severity = judge(float(chi2.sf(value, dof)), 1, large=True)
+    severity = judge(float(chi2.sf(value, dof)), 1, large=bool(value > GROSS * dof))
     if severity:
         sigma = np.where(known, np.abs(error) / np.sqrt(np.where(known, np.diag(P), 1.0)), 0.0)
         worst = int(np.argmax(sigma))
@@ -59,7 +63,7 @@ def by_part(case: Case) -> Iterator[Finding]:
     taken, for it is an estimate itself.
     """
     run = case.run
-    if run.labels or "mean" not in run.ends:
+    if run.labels or "mean" not in run.ends or is_registration(case):
         return
     counts = run.step >= case.first
     found = []
@@ -79,7 +83,7 @@ def by_part(case: Case) -> Iterator[Finding]:
         total = mean * independent
         p = 2 * min(chi2.sf(total, dof * independent), chi2.cdf(total, dof * independent))
         ratio = mean / dof
-        severity = judge(p, 2 * len(found), large=ratio > _GROSS**2)
+        severity = judge(p, 2 * len(found), large=float(chi2.sf(total / GROSS, dof * independent)))
         if severity is None:
             continue
         evidence = {"part": name, "mean_nees": mean, "dof": dof, "independent": independent, "p": p}
@@ -95,12 +99,14 @@ def by_part(case: Case) -> Iterator[Finding]:
 
 def _too_sure(case: Case, name: str) -> tuple[str, str]:
     """Why a part's error may be larger than its covariance, and what to try, by the kind of estimator."""
-    if any("rmse" in table.values for table in case.run.stages.values()):
-        return (
-            "it takes each pair of points as right and its error as its own, while neighbours share them (Censi 2007)",
-            "do not weigh by this covariance; take the spread of registrations from several starts, or a fixed one",
-        )
     if case.run.properties.get("belief") == "Particles":
+        if clouds.moves(case) is not None and not list(motion.prediction(case)):
+            return (
+                "each step moves the particles as the truth moves, so that the readings pull the cloud away, or it is "
+                "too narrow: too few particles, or noises that are too small",
+                "check the readings' order, units, offsets and stamps, and the places of what they are read from; then "
+                "take more particles and wider noises",
+            )
         return (
             "the cloud is too narrow, or sits in a wrong place: too few particles, noises that are too small, or "
             "readings and motion that do not belong together",

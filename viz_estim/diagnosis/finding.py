@@ -2,14 +2,23 @@
 
 A run has so many sensors, components and checks that one of them would always look odd. Each statistical check
 therefore states the probability p that data of the filter's own model look as odd as this, and p is held to an equal
-share of the run's budget (Bonferroni): of 10⁻⁴ for an error, of 0.05 for a warning. An error must be large besides:
-with enough data every filter is wrong by a little. A check of what cannot be (an asymmetric covariance) costs nothing.
+share of the run's budget (Bonferroni): of 10⁻⁴ for an error, of 0.05 for a warning. A check of what cannot be (an
+asymmetric covariance) costs nothing.
+
+An error must be large besides, for with enough data every filter is wrong by a little. One yardstick serves all: a
+variance that is wrong by the factor `GROSS`, 2, which is a standard deviation wrong by 1.4, a bias as large as the
+standard deviation it hides in, or readings of which each second one tells nothing. Where an effect is estimated, an
+error is no matter of the estimate but of a test against that size (a minimum-effect test; Murphy and Myors 1999): the p
+of data in which the effect *is* that large must be below the error's share too. So errors keep to 10⁻⁴ a run not only
+where a filter's model is exact, but wherever it is wrong by less than that.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
+
+import numpy as np
 
 Severity = Literal["error", "warning", "note"]
 
@@ -24,7 +33,7 @@ CODES = {
     "biased_innovation": "innovations lie off zero on one side",
     "coloured_innovation": "an innovation tells of the next one: something systematic is left in them",
     "outliers": "more readings lie far off than the noise allows",
-    "gate": "a gate refuses too many readings, or is locked out",
+    "gate": "a gate refuses too many readings, is locked out, or lets pass what it should refuse",
     "diverged": "error or NIS leaves its bounds and does not come back",
     "stamps": "gaps, duplicates or steps back in time; a dt that is not the stamps' difference",
     "lag": "a sensor's readings are constantly late or early against the state",
@@ -58,6 +67,7 @@ SYMPTOMS = _LATER[-1]
 _ORDER: tuple[Severity, ...] = ("error", "warning", "note")
 
 _BUDGET: dict[Severity, float] = {"error": 1e-4, "warning": 0.05}  # false alarms a run
+GROSS = 2.0  # the factor on a variance from which on it is an error
 _FAMILIES = 30  # statistical checks: each has an equal share, and shares it out among what it tests
 
 
@@ -92,8 +102,12 @@ def level(severity: Severity, tests: int) -> float:
     return _BUDGET[severity] / _FAMILIES / max(1, tests)
 
 
-def judge(p: float, tests: int, *, large: bool) -> Severity | None:
-    """What a test's p makes it, of `tests` in this run: an error only where the effect is large too."""
+def judge(p: float, tests: int, *, large: bool | float) -> Severity | None:
+    """What a test's p makes it, of `tests` in this run: an error only where the effect is large too.
+
+    large: whether it is, or the p of data in which it is just as large as an error's.
+    """
     if not p < level("warning", tests):  # also NaN
         return None
-    return "error" if large and p < level("error", tests) else "warning"
+    sure = large if isinstance(large, bool | np.bool_) else large < level("error", tests)
+    return "error" if sure and p < level("error", tests) else "warning"

@@ -12,7 +12,7 @@ from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.covariance import epsilon
 from viz_estim.diagnosis.evidence import Case, tells_reading
 from viz_estim.diagnosis.finding import Finding, level
-from viz_estim.diagnosis.kinematics import imu_axes
+from viz_estim.diagnosis.kinematics import imu_axes, scale
 from viz_estim.recording.layout import leaves
 
 _BURST, _BESIDE = 100.0, 0.3  # of the usual S; rad from ±π
@@ -68,9 +68,9 @@ def quaternion_norms(case: Case) -> Iterator[Finding]:
                 "average attitudes on the manifold (SO3().mean), and move them by SO3().plus",
             )  # fmt: skip
         q = run.mean[:, at]
-        flips = np.flatnonzero(((q[1:] * q[:-1]).sum(1) < -0.5) & (run.step[1:] > case.first)) + 1
+        flips = np.flatnonzero(((q[1:] * q[:-1]).sum(1) < 0) & (run.step[1:] > case.first)) + 1
         turned = np.linalg.norm(SO3().minus(q[1:], q[:-1]), axis=1)
-        flips = flips[turned[flips - 1] < 1.0]
+        flips = flips[turned[flips - 1] < np.pi / 2]  # by a half turn either sign is as near
         if len(flips) > 1 and len(flips) > len(q) / 200:
             yield Finding(
                 "angle_wrap", "warning", None, (int(run.step[flips[0]]), int(run.step[flips[-1]])),
@@ -88,7 +88,7 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
     inequality on a likelihood ratio; Ville 1939).
     """
     told = set()
-    for finding in imu_axes(case):
+    for finding in list(imu_axes(case)) or list(scale(case)):
         told.add(finding.sensor)
         yield finding
     for name, readings in case.sensors.items():

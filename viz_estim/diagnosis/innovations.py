@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 from viz_estim.core.consistency import nees
-from viz_estim.core.distributions import binom, chi2, t
+from viz_estim.core.distributions import binom, chi2, f, norm, t
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import Finding, judge, level
+from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
+from viz_estim.diagnosis.icp import is_registration
 
 _FEWEST = 20
 _LAGS = 10
 _STRETCHES = 20
-_LARGE_BIAS, _LARGE_CORRELATION = 0.5, 0.5  # of a standard deviation; of a correlation
+# The correlation ρ of neighbours in a first-order process whose mean has a variance larger by GROSS, (1 + ρ)/(1 − ρ).
+_CORRELATED = (GROSS - 1) / (GROSS + 1)
 _TAIL = 1e-3  # the share of readings beyond the χ² quantile by which outliers are counted
-_LARGE_SHARE = 0.02
-_REFUSED = 0.05  # the share of readings that a gate may refuse
 
 
 def biased(case: Case) -> Iterator[Finding]:
@@ -27,6 +27,9 @@ def biased(case: Case) -> Iterator[Finding]:
 
     The standard error takes autocorrelation in: s·√(τ/N), τ = 1 + 2·Σρₖ over the first lags, at least 1; and the means
     of 20 stretches of the run must say the same (batch means; Schmeiser 1982): the larger p counts.
+
+    Large is a bias b that doubles the squared error with which the filter foresees the reading: b² = (H·P·Hᵀ)ᵢᵢ. The
+    noise of the reading itself is no measure: a filter averages it away, and not the bias.
     """
     tests = sum(readings.dof for readings in case.sensors.values())
     for name, readings in case.sensors.items():
@@ -42,8 +45,12 @@ def biased(case: Case) -> Iterator[Finding]:
             score = mean / error
             stretches = np.array([piece.mean() for piece in np.array_split(values, min(_STRETCHES, N // 5))])
             apart = mean / max(float(stretches.std(ddof=1)) / np.sqrt(len(stretches)), 1e-300)
-            p = float(max(2 * t.sf(abs(score), max(1, N / tau - 1)), 2 * t.sf(abs(apart), len(stretches) - 1)))
-            severity = judge(p, tests, large=abs(mean) > _LARGE_BIAS)
+            below = max(0.0, 1 - _own_share(readings, i) ** 0.5 / abs(mean))  # what of it is beyond a large one
+            p, p_large = (
+                float(max(2 * t.sf(k * abs(score), max(1, N / tau - 1)), 2 * t.sf(k * abs(apart), len(stretches) - 1)))
+                for k in (1.0, below)
+            )
+            severity = judge(p, tests, large=p_large)
             if severity:
                 value, unit = float(readings.residual[:, i].mean()), readings.space.axis_units[i]
                 evidence = {"component": axis, "mean": value, "mean_sigma": mean, "z": score, "p": p}
@@ -58,8 +65,17 @@ def biased(case: Case) -> Iterator[Finding]:
                 break  # one finding a sensor: its worst-known component leads on
 
 
+def _own_share(readings: Readings, i: int) -> float:
+    """The state's share of a component's variance, (H·P·Hᵀ/S)ᵢᵢ in the mean; 1 where R is not recorded."""
+    return float(np.mean(1 - readings.noise[:, i, i] / readings.cov[:, i, i]))
+
+
 def coloured(case: Case) -> Iterator[Finding]:
-    """Ljung and Box (1978): Q = N(N+2)·Σₖ ρₖ²/(N−k) over the lags and the whitened components is χ²(lags·m)."""
+    """Ljung and Box (1978): Q = N(N+2)·Σₖ ρₖ²/(N−k) over the lags and the whitened components is χ²(lags·m).
+
+    Large is a correlation of 1/3: the mean of N such readings is as uncertain as that of N/2 that are white. atanh ρ is
+    normal about that of the true one with 1/√(N − 3) (Fisher 1921); the strongest of all is taken.
+    """
     for name, readings in case.sensors.items():
         N = len(readings)
         lags = min(_LAGS, N // 5)
@@ -71,7 +87,8 @@ def coloured(case: Case) -> Iterator[Finding]:
         p = float(chi2.sf(Q, rho.size))
         component, lag = np.unravel_index(np.argmax(np.abs(rho)), rho.shape)
         strongest = float(rho[component, lag])
-        severity = judge(p, len(case.sensors), large=abs(strongest) > _LARGE_CORRELATION)
+        beyond = np.arctanh(min(abs(strongest), 1 - 1e-12)) - np.arctanh(_CORRELATED)
+        severity = judge(p, len(case.sensors), large=float(rho.size * norm.sf(beyond * np.sqrt(N - 3))))
         if severity:
             seconds = float(np.median(readings.time[lag + 1 :] - readings.time[: -(lag + 1)]))
             evidence = {"ljung_box": Q, "p": p, "lag": int(lag) + 1, "lag_s": seconds, "autocorrelation": strongest}
@@ -113,9 +130,10 @@ def _autocorrelations(values: Array, lags: int = _LAGS) -> Array:
 
 
 def outliers(case: Case) -> Iterator[Finding]:
-    """How many NIS lie beyond the χ² quantile of 1 − 10⁻³: binomial, if the tails are normal.
+    """How many NIS lie beyond the χ² quantile of 1 − 10⁻³: binomial, if the tails are normal; and how far the largest.
 
-    NIS are first brought to their median, where that is above χ²'s: a noise that is too small is no outlier.
+    NIS are first brought to their median, where that is above χ²'s: a noise that is too small is no outlier. Large are
+    those that no gate refuses and that alone double the mean of all.
     """
     for name, readings in case.sensors.items():
         N, dof = len(readings), readings.dof
@@ -124,8 +142,9 @@ def outliers(case: Case) -> Iterator[Finding]:
         scale = max(1.0, float(np.median(readings.nis)) / chi2.median(dof))
         far = readings.nis / scale > chi2.isf(_TAIL, dof)
         count = int(far.sum())
-        p = float(binom.sf(count - 1, N, _TAIL))
-        severity = judge(p, len(case.sensors), large=count > _LARGE_SHARE * N)
+        p = float(min(binom.sf(count - 1, N, _TAIL), N * chi2.sf(readings.nis.max() / scale, dof)))
+        moving = (readings.nis[far & readings.used] / scale - dof).sum()
+        severity = judge(p, 2 * len(case.sensors), large=bool(moving > (GROSS - 1) * dof * N))
         if severity:
             rows = np.flatnonzero(far)
             gated = int((~readings.used[far]).sum())
@@ -134,7 +153,7 @@ def outliers(case: Case) -> Iterator[Finding]:
             remedy = (
                 f"the gate refuses {gated} of them; look at the others by hand"
                 if gated
-                else f"set a gate ({_gate_name(case, name)}=0.999) so that they move nothing; see where they come from"
+                else f"set a gate ({gate_name(case, name)}=0.999) so that they move nothing; see where they come from"
             )
             yield Finding(
                 "outliers", severity if gated < count else "note", name,
@@ -145,52 +164,17 @@ def outliers(case: Case) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def _gate_name(case: Case, name: str) -> str:
+def gate_name(case: Case, name: str) -> str:
+    """The parameter by which a sensor's gate is set."""
     known = parameter(case.run, f"{name}_gate", "gate")
     return known[0] if known else "gate"
-
-
-def gates(case: Case) -> Iterator[Finding]:
-    """A gate that refuses more than 5 % of the readings (binomial), or that has locked itself out.
-
-    Locked out: so long a row of refusals as would come by chance with 5 % refused, p = N·0.05ⁿ.
-    """
-    for name, readings in case.sensors.items():
-        refused = ~readings.used
-        N, count = len(readings), int(refused.sum())
-        if not count:
-            continue
-        first, length = _longest(refused)
-        p_row, p = min(1.0, N * _REFUSED**length), float(binom.sf(count - 1, N, _REFUSED))
-        locked = p_row < level("error", 2 * len(case.sensors)) and first + length == N
-        severity = judge(min(p, p_row), 2 * len(case.sensors), large=locked or count > 0.25 * N)
-        if severity:
-            start = first if locked else int(np.argmax(refused))
-            steps = int(readings.step[start]), int(readings.step[np.flatnonzero(refused)[-1]])
-            evidence = {"refused": count, "readings": N, "longest_row": length, "p": min(p, p_row)}
-            gate = _gate_name(case, name)
-            how = f"the gate of {name} refuses {count} of {N} readings"
-            if locked:
-                cause = f"{how}, and from step {steps[0]} on all of them: the estimate has left, and can't come back"
-                remedy = f"set {gate}=none to see what is refused; raise the noises that are too small, then gate again"
-            else:
-                cause = f"{how}, where 5 % would be many: it is too narrow, or S is too small"
-                remedy = f"set {gate}=0.999, or none; if readings are then far off, mend the noise of {name} first"
-            yield Finding("gate", severity, name, steps, evidence, cause, remedy)
-
-
-def _longest(flags: np.ndarray) -> tuple[int, int]:
-    """Start and length of the longest row of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
-    lengths = edges[:, 1] - edges[:, 0]
-    best = int(np.argmax(lengths))
-    return int(edges[best, 0]), int(lengths[best])
 
 
 def diverged(case: Case) -> Iterator[Finding]:
     """NIS leaves for good: from some step on every block of readings lies above its χ² band, after some that did not.
 
-    A block's sum is χ²(B·dof); a row of n such blocks at the level α each has the probability αⁿ.
+    A block's sum is χ²(B·dof); a row of n such blocks at the level α each has the probability αⁿ. By then innovations
+    are twice as large, and NIS larger than before by a factor that is beyond GROSS for sure, by F.
     """
     for name, readings in case.sensors.items():
         block, blocks = _blocks(readings)
@@ -203,10 +187,12 @@ def diverged(case: Case) -> Iterator[Finding]:
         start = int(low[-1]) + 1 if len(low) else 0
         row = blocks - start
         growth = float(sums[start:].mean() / max(sums[:start].mean(), 1e-300)) if 0 < start < blocks else 0.0
-        if row < 3 or growth < 4:
+        if row < 3 or growth < GROSS**2:
             continue
+        n = block * readings.dof
         at = len(readings) - block * (blocks - start)
-        severity = judge(blocks * alpha**row, len(case.sensors), large=growth > 4)
+        p_large = float(f.sf(growth / GROSS, n * row, n * start))
+        severity = judge(blocks * alpha**row, len(case.sensors), large=p_large)
         if severity:
             steps = int(readings.step[at]), int(readings.step[-1])
             evidence = {"onset_step": steps[0], "onset_s": float(readings.time[at]), "growth": growth}
@@ -228,11 +214,12 @@ def _blocks(readings: Readings) -> tuple[int, int]:
 def lost(case: Case) -> Iterator[Finding]:
     """The error leaves for good: from some step to the end every NEES is beyond χ²'s quantile of an error's level.
 
-    Whatever came before, that takes the last step to be beyond it, which chance does with that level. At most a warning
-    where it lasts less than a tenth of the run.
+    Whatever came before, that takes the last step to be beyond it, which chance does with that level. An error where
+    it doubles the mean NEES of the whole run; no finding where it is shorter than a twentieth of it, for a run may end
+    anywhere.
     """
     run = case.run
-    if run.labels or "mean" not in run.ends or run.properties.get("belief") == "Particles":
+    if run.labels or "mean" not in run.ends or run.properties.get("belief") == "Particles" or is_registration(case):
         return
     values, dof = nees(run.space, run.mean, run.cov, run.truth)
     rows = np.flatnonzero(np.isfinite(values) & (run.step >= case.first))
@@ -243,11 +230,12 @@ def lost(case: Case) -> Iterator[Finding]:
     lasting = len(rows) - start
     if lasting < max(3, len(rows) // 20):
         return
+    large = float((values[rows[start:]] - dof).sum()) > (GROSS - 1) * dof * len(rows)
     steps = int(run.step[rows[start]]), int(run.step[rows[-1]])
     evidence = {"onset_step": steps[0], "mean_nees": float(values[rows[start:]].mean()), "dof": dof}
     since = "from the start" if start == 0 else f"from step {steps[0]} on"
     yield Finding(
-        "diverged", "error" if lasting > len(rows) / 10 else "warning", None, steps, evidence,
+        "diverged", "error" if large else "warning", None, steps, evidence,
         f"{since} the estimate is further from the truth than its covariance allows, to the end: it is sure of a wrong "
         "state" + (", such as a mirror image that explains the readings as well" if start == 0 else ""),
         f"go to step {steps[0]} and see which stage moves it away; a start elsewhere, or a larger initial covariance, "

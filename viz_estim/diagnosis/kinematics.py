@@ -7,16 +7,19 @@ from collections.abc import Iterator
 import numpy as np
 
 from viz_estim.core import quaternions
+from viz_estim.core.distributions import t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3
 from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import Finding, level
+from viz_estim.diagnosis.finding import Finding, judge, level
+from viz_estim.diagnosis.fits import STRETCHES
 from viz_estim.diagnosis.sensors import Imu, imu
 from viz_estim.scenarios.imu_health import GRAVITY
 
 _WINDOW = 0.1  # s over which gravity's turn is compared with the gyro's
 _DEPENDENT = 4  # windows that share one push of the hand
+_SHEET = 0.05  # of a sensitivity
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -59,6 +62,49 @@ def imu_axes(case: Case) -> Iterator[Finding]:
         factor = min((abs(np.log(length * M[0, 0] / GRAVITY)), t) for t, M in maps(3, "m/s²") if t[:4] != "axes")
         if factor[0] < 0.2:
             yield finding_of("accel", steps, factor[1], 1 - abs(1 - np.exp(factor[0])), float(len(both.rows)))
+
+
+def scale(case: Case) -> Iterator[Finding]:
+    """ġ = −(s∘ω) × g: the factor s of each axis of the gyro, or of all three, by least squares over the windows.
+
+    Errors of its variance by 20 stretches of the run (Liang and Zeger 1986), so that a push of the hand counts once.
+    Told where s is further from 1 than 5 %, by a t-test against that: what a data sheet leaves to a calibration.
+    """
+    both = imu(case.run)
+    pieces = None if both is None else _windows(case, both)
+    if both is None or pieces is None:
+        return
+    turn, middle, change, steps = pieces
+    axes = np.stack([-np.cross(turn[:, [i]] * np.eye(3)[i], middle) for i in range(3)], axis=-1)  # (W, 3, 3)
+    found = [one for X in (axes.sum(-1, keepdims=True), axes) for one in _slopes(X, change)]
+    if not found:
+        return
+    s, p = min(found, key=lambda one: one[1])
+    severity = judge(p, len(found), large=True)
+    if severity and s > 0:
+        k = next(k for k, one in enumerate(found) if one[1] == p)
+        which = "gyro" if k == 0 else f"gyro's {'xyz'[k - 1]}"
+        yield Finding(
+            "units_or_axes", severity, "gyro", steps,
+            {"map": f"a factor of {1 / s:.3g}", "p": p, "factors": [1 / one[0] for one in found]},
+            f"the {which} reads {1 / s:.3g}× the turn that gravity shows: its sensitivity is another one",
+            f"divide the {which} by {1 / s:.3g}, or calibrate it (`viz-estim calibrate imu`)",
+        )  # fmt: skip
+
+
+def _slopes(X: Array, change: Array) -> list[tuple[float, float]]:
+    """The coefficients of change (W, 3) on X (W, 3, k), and the p of each if it is 5 % off 1 at most."""
+    A = np.einsum("wki,wkj->ij", X, X)
+    if not np.isfinite(A).all() or np.linalg.cond(A) > 1e6:
+        return []
+    inverse = np.linalg.inv(A)
+    s = inverse @ np.einsum("wki,wk->i", X, change)
+    scores = np.einsum("wki,wk->wi", X, change - X @ s)
+    parts = np.array([part.sum(0) for part in np.array_split(scores, STRETCHES)])
+    robust = inverse @ (parts.T @ parts) @ inverse * STRETCHES / (STRETCHES - 1)
+    error = np.sqrt(np.maximum(np.diag(robust), np.finfo(float).tiny))
+    p = 2 * t.sf(np.maximum(np.abs(s - 1) - _SHEET, 0) / error, STRETCHES - 1)
+    return list(zip(s.tolist(), p.tolist(), strict=True))
 
 
 def _windows(case: Case, both: Imu) -> tuple[Array, Array, Array, tuple[int, int]] | None:

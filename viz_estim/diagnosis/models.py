@@ -1,7 +1,10 @@
 """Are the Jacobians the models' derivatives, and is the prediction free of chance?
 
 A linearised filter's record holds its model at the mean and its Jacobian there. Between two steps the trapezoid rule
-must hold, f(b) − f(a) = ½(F_a + F_b)·(b ⊟ a), up to the third order in the step. No rerun is needed.
+must hold, f(b) − f(a) = ½(F_a + F_b)·(b ⊟ a). By how much it may fail is bounded: f(b) − f(a) is the mean of F along
+the way times b ⊟ a, and where F's entries go from one end to the other without turning back, that mean is no further
+from ½(F_a + F_b) than half of their difference, entry by entry. So no chance and no size of step makes a right Jacobian
+look wrong; what a wrong one leaves is counted beyond that bound and beyond rounding. No rerun is needed.
 """
 
 from __future__ import annotations
@@ -13,11 +16,14 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.evidence import Case, tells_gain
-from viz_estim.diagnosis.finding import Finding
+from viz_estim.diagnosis.finding import GROSS, Finding, Severity
 
-# The share of the model's change that a Jacobian leaves. Where it changes the expected by less than a tenth in a step,
-# the trapezoid rule is off by a third of the square of that, 0.3 %, and a wrong row or sign by more than a half.
-_UNEXPLAINED = 0.3
+# The share of its model's change by which a Jacobian is wrong that makes H·P·Hᵀ wrong by GROSS: (1 + s)² = 2.
+_LARGE = GROSS**0.5 - 1
+# Of the squares of what a sampled prediction leaves, n' − n of two draws, the motion in between holds n and not n': it
+# explains at most a half, while it explains all that a wrong Jacobian leaves.
+_HALF = 0.5
+_UNFELT = 0.05  # of Q's variance
 _FEWEST = 10
 
 
@@ -38,34 +44,51 @@ def measured(case: Case) -> Iterator[Finding]:
         seen = space.minus(
             table.values["innovation.predicted"][rows[1:]], table.values["innovation.predicted"][rows[:-1]]
         )
-        expected = (0.5 * (H[1:] + H[:-1]) @ moved[..., None])[..., 0]
+        expected, may = _trapezoid(H[1:], H[:-1], moved)
+        predicted = np.abs(table.values["innovation.predicted"][rows])
         for name, axes in space.axes_at.items():
-            bent = (H[1:, axes] - H[:-1, axes]) @ moved[..., None]
-            left = _left(seen[:, axes], expected[:, axes], bent[..., 0])
-            if left > _UNEXPLAINED:
+            largest = predicted[:, space.at[name]].max(initial=0.0)
+            left, count = _left(seen[:, axes], expected[:, axes], may[:, axes], float(largest))
+            if severity := _severity(left, count * (axes.stop - axes.start)):
                 steps = int(table.step[rows[0]]), int(table.step[rows[-1]])
-                yield _wrong(f"H of {name}", name.partition("/")[0], steps, left, "the measurement model h(x)")
+                sensor = name.partition("/")[0]
+                yield _wrong(f"H of {name}", severity, sensor, steps, left, "the measurement model h(x)")
                 break
 
 
-def _left(change: Array, expected: Array, bent: Array) -> float:
-    """The share of the changes (M, m) that the expected ones leave: the median of |change − expected|/|change|.
+def _trapezoid(after: Array, before: Array, moved: Array) -> tuple[Array, Array]:
+    """½(F_a + F_b)·δ (M, m) of Jacobians (M, m, d) and steps δ (M, d), and the bound on its error: ½|F_b − F_a|·|δ|."""
+    expected = 0.5 * (after + before) @ moved[..., None]
+    return expected[..., 0], (0.5 * np.abs(after - before) @ np.abs(moved)[..., None])[..., 0]
 
-    Of steps alone over which the Jacobian itself changes the expected by less than a tenth (bent, (M, m)): there the
-    trapezoid rule is exact.
+
+def _left(change: Array, expected: Array, may: Array, largest: float) -> tuple[float, int]:
+    """The median share of the changes (M, m) by which the expected ones miss them beyond what they may; of how many.
+
+    largest: of the numbers whose differences the changes are, for their rounding. Steps that tell little are left out:
+    of which the bound is more than a half.
     """
     size = np.linalg.norm(change, axis=1)
-    rows = (size > 1e-9) & (np.linalg.norm(bent, axis=1) < 0.1 * size)
+    missed = np.linalg.norm(np.maximum(np.abs(change - expected) - may, 0.0), axis=1)
+    rows = (size > 1e6 * np.finfo(float).eps * max(largest, 1.0)) & (np.linalg.norm(may, axis=1) < _HALF * size)
     if rows.sum() < _FEWEST:
-        return 0.0
-    return float(np.median(np.linalg.norm(change - expected, axis=1)[rows] / size[rows]))
+        return 0.0, 0
+    return float(np.median(missed[rows] / size[rows])), int(rows.sum())
+
+
+def _severity(left: float, count: int) -> Severity | None:
+    """An error where the variance is wrong by GROSS, a warning where as many numbers could tell it, 1 ± √(2/count)."""
+    if count == 0 or (1 + left) ** 2 < 1 + np.sqrt(2 / count):
+        return None
+    return "error" if left > _LARGE else "warning"
 
 
 def predicted(case: Case) -> Iterator[Finding]:
     """F against how the prediction changes with the state, and whether what is left looks like a sample of Q.
 
     Only between steps with the same control and dt. What is left, r, is whitened by 2Q: r of a deterministic prediction
-    is of the third order; with a sample of the noise it is N(0, 2Q), so that rᵀ(2Q)⁺r is the rank of Q in the mean.
+    is 0 beyond its bound; with a sample of the noise it is N(0, 2Q), so that rᵀ(2Q)⁺r is the rank of Q in the mean. A
+    sample of less than 5 % of Q's variance is not told: the run's own NIS would take 800 readings to show it.
     """
     run = case.run
     for table in run.stages.values():
@@ -79,16 +102,20 @@ def predicted(case: Case) -> Iterator[Finding]:
             continue
         moved = case.space.minus(before[1:], before[:-1])[alike]
         change = case.space.minus(table.mean[1:], table.mean[:-1])[alike]
-        expected = (0.5 * (F[1:] + F[:-1])[alike] @ moved[..., None])[..., 0]
+        expected, may = _trapezoid(F[1:][alike], F[:-1][alike], moved)
         steps = int(table.step[0]), int(table.step[-1])
-        bent = ((F[1:] - F[:-1])[alike] @ moved[..., None])[..., 0]
         rest = change - expected
+        rest = np.sign(rest) * np.maximum(np.abs(rest) - may, 0.0)
         values, vectors = np.linalg.eigh(2 * Q[1:][alike])
         held = values > 1e-12 * np.maximum(values[:, -1:], 1e-300)
         white = np.einsum("mij,mi->mj", vectors, rest) / np.sqrt(np.where(held, values, np.inf))
         ratio = float(np.median((white**2).sum(1) / np.maximum(held.sum(1), 1)))
         drift = _follows(rest, moved)
-        if 0.05 < ratio < 20 and drift < 0.3:
+        told = "control" in run.inputs  # else the prediction may follow what the recording does not hold
+        largest = float(np.abs(table.mean).max())
+        left, count = _left(change - moved, expected - moved, may, largest)
+        size = np.median(np.linalg.norm(rest, axis=1))
+        if size > 1e6 * np.finfo(float).eps * max(largest, 1.0) and ratio > _UNFELT and drift < _HALF:
             evidence = {"size_in_Q": ratio, "stage": table.name}
             yield Finding(
                 "noisy_prediction", "error", None, steps, evidence,
@@ -96,8 +123,8 @@ def predicted(case: Case) -> Iterator[Finding]:
                 "of the process noise is added to it",
                 "predict the mean by the model alone; the noise enters the covariance, as + Q",
             )  # fmt: skip
-        elif (left := _left(change - moved, expected - moved, bent)) > _UNEXPLAINED and drift > 0.5:
-            yield _wrong("F", None, steps, left, "the process model f(x)")
+        elif (drift > _HALF or (told and ratio <= _UNFELT)) and (severity := _severity(left, count * change.shape[1])):
+            yield _wrong("F", severity, None, steps, left, "the process model f(x)")
 
 
 def _alike(case: Case, row: np.ndarray) -> np.ndarray:
@@ -119,9 +146,9 @@ def _follows(rest: Array, moved: Array) -> float:
     return float(1 - (left**2).sum() / max((rest**2).sum(), 1e-300))
 
 
-def _wrong(what: str, sensor: str | None, steps: tuple[int, int], left: float, of: str) -> Finding:
+def _wrong(what: str, severity: Severity, sensor: str | None, steps: tuple[int, int], left: float, of: str) -> Finding:
     return Finding(
-        "jacobian", "error", sensor, steps, {"unexplained": left, "matrix": what},
+        "jacobian", severity, sensor, steps, {"unexplained": left, "matrix": what},
         f"{what} is not the derivative of {of}: it leaves {left:.0%} of its change from step to step unexplained, as a "
         "transposed matrix, a wrong sign or a wrong row would",
         "compare it with `viz_estim.core.kalman.finite_differences`, entry by entry",

@@ -10,11 +10,15 @@ import numpy as np
 from viz_estim.core.distributions import chi2, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, wrap
+from viz_estim.diagnosis import clouds
 from viz_estim.diagnosis.axes import maps
 from viz_estim.diagnosis.evidence import Case, transitions
 from viz_estim.diagnosis.finding import Finding, judge
-from viz_estim.diagnosis.truth import FEWEST, STRETCHES, SURELY, named
+from viz_estim.diagnosis.fits import STRETCHES
+from viz_estim.diagnosis.truth import FEWEST, SURELY, named
 from viz_estim.diagnosis.truth import slip as bound
+
+_ALIKE = 1.01  # of the squares that are left: as well explained
 
 
 def prediction(case: Case) -> Iterator[Finding]:
@@ -25,6 +29,9 @@ def prediction(case: Case) -> Iterator[Finding]:
     """
     run = case.run
     if run.labels:
+        return
+    if (carried := clouds.moves(case)) is not None:
+        yield from _of_a_cloud(case, carried)
         return
     moves = [(table, F) for table in run.stages.values() if (F := transitions(case, table)) is not None]
     if not np.isfinite(run.truth).any() or len(moves) != 1:
@@ -55,7 +62,9 @@ def prediction(case: Case) -> Iterator[Finding]:
         if near.sum() >= FEWEST:
             of = table.step[known][near]
             moving[i] = told[near] + w[near], told[near], of
-            told_of += _moves_as(case, name, i, of, w[near], told[near], dt[near], slip[near], 2 * d)
+            axis, unit = case.space.axes[i].rpartition(".")[2], case.space.axis_units[i]
+            label = name if axis in ("", name, "angle") else f"{name} {axis}"
+            told_of += _moves_as(label, unit, of, w[near], told[near], dt[near], slip[near], 2 * d)
     for name, part in case.space.parts.items():
         axes = range(case.space.axes_at[name].start, case.space.axes_at[name].stop)
         if isinstance(part, SO3) and all(i in moving and len(moving[i][0]) == len(moving[axes[0]][0]) for i in axes):
@@ -63,9 +72,27 @@ def prediction(case: Case) -> Iterator[Finding]:
             if (found := _turns_as(name, truly, told, moving[axes[0]][2])) is not None:
                 yield found
                 return
+    yield from _best(told_of)
+
+
+def _of_a_cloud(case: Case, carried: clouds.Moves) -> Iterator[Finding]:
+    """The same of particles, in the body's frame."""
+    dt = case.run.dt[np.searchsorted(case.run.step, carried.step)]
+    rows = dt > 0
+    if rows.sum() < FEWEST:
+        return
+    none = np.zeros(int(rows.sum()))
+    told_of: list[tuple[float, Finding]] = []
+    for i, (label, unit) in enumerate((("the way ahead", "m"), ("the way to the left", "m"), ("heading", "rad"))):
+        told, truly = carried.told[rows, i], carried.truly[rows, i]
+        told_of += _moves_as(label, unit, carried.step[rows], truly - told, told, dt[rows], none, 6)
+    yield from _best(told_of)
+
+
+def _best(told_of: list[tuple[float, Finding]]) -> Iterator[Finding]:
+    """One cause shows in several components: the one that it explains best is told."""
+    told_of = sorted(told_of, key=lambda entry: (entry[1].severity != "error", -entry[0]))
     if told_of:
-        # One cause shows in several components: the one that it explains best is told.
-        told_of.sort(key=lambda entry: (entry[1].severity != "error", -entry[0]))
         also = [f.evidence for _, f in told_of[1:]]
         yield replace(told_of[0][1], evidence=told_of[0][1].evidence | ({"also": also} if also else {}))
 
@@ -87,7 +114,7 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray) -> Finding |
 
 
 def _moves_as(
-    case: Case, name: str, i: int, of: np.ndarray, w: Array, told: Array, dt: Array, slip: Array, tests: int
+    label: str, unit: str, of: np.ndarray, w: Array, told: Array, dt: Array, slip: Array, tests: int
 ) -> Iterator[tuple[float, Finding]]:
     """w = (c − 1)·Δ' + b·dt: which of the two is off, if any. By rates, so that a long step counts like others.
 
@@ -105,8 +132,6 @@ def _moves_as(
     explains = abs(beta) * float(np.abs(told).mean()) if by_factor else abs(drift)
     if explains < 2 * float(np.quantile(slip, 0.95)):
         return
-    axis, unit = case.space.axes[i].rpartition(".")[2], case.space.axis_units[i]
-    label = name if axis in ("", name, "angle") else f"{name} {axis}"
     steps = int(of[0]), int(of[-1])
     if by_factor:
         if (ends[0] - 1) * (ends[1] - 1) <= 0:
@@ -119,6 +144,8 @@ def _moves_as(
         sign = (
             "its sign is wrong"
             if abs(factor + 1) < 0.2
+            else "a dt that is multiplied once too often"
+            if abs(factor / float(np.median(dt)) - 1) < 0.1
             else named(factor, unit)
             if factor > 0
             else "a wrong sign and size"
@@ -134,6 +161,8 @@ def _moves_as(
             f"the prediction misses a steady {drift:+.3g} {unit}/s of {label}: the control that moves it has a bias, "
             "or a force is missing from the model"
         )
+        if left_factor < _ALIKE * left_drift:  # it was always told the same
+            cause += f"; or it moves by {1 / (1 + beta):.3g}× what it does, which looks alike at one speed"
         remedy = f"calibrate that bias ({drift:+.3g} {unit}/s), or add it to the state and let the filter estimate it"
         evidence = {"component": label, "drift": drift, "p": p_drift}
     if severity:

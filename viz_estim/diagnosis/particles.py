@@ -20,7 +20,6 @@ _LOOKED_AT = 200  # steps at most, at which modes are looked for
 # of twenty cases: with n independent ones it is χ²(n − 1)/(n − 1) of the true one.
 _GROSS, _ONE_IN_TWENTY = 2.0, 0.05
 _FEW = next(n for n in range(2, 100) if chi2.cdf((n - 1) / _GROSS, n - 1) < _ONE_IN_TWENTY)
-_HELD = 0.02  # the share of a cloud at a bound that pulls its mean
 _NEAR = 0.1  # the share of a normal cloud that lies about its mean, to be held against what does
 
 
@@ -69,10 +68,11 @@ def clamped(case: Case) -> Iterator[Finding]:
     """Particles that are held at a bound: several share one extreme number that are no copies of one another.
 
     Of N draws of a continuous number two are equal with N²·ε at most (a birthday among 1/ε values), so that three that
-    are is no chance. An error where the share that is held moves the mean.
+    are is no chance. An error where the share that is held is beyond 1/√N: an edge lies a standard deviation σ or more
+    from the mean, so that they pull it by more than a sample of N scatters it, σ/√N.
     """
     found: list[int] = []
-    most = 0.0
+    most, scatter = 0.0, 1 / max(_count(case), 1) ** 0.5
     for table in case.run.stages.values():
         if not table.name.startswith("predict") or "states" not in table.values:
             continue
@@ -86,7 +86,7 @@ def clamped(case: Case) -> Iterator[Finding]:
                         most = max(most, float((x == end).mean()))
     if found:
         yield Finding(
-            "particles_clamped", "error" if most > _HELD else "warning", None, (min(found), max(found)),
+            "particles_clamped", "error" if most > scatter else "warning", None, (min(found), max(found)),
             {"steps": len(set(found)), "largest_share": most},
             f"at {len(set(found))} steps many particles share the very same number at the edge of the cloud: they are "
             "held at a bound, where they pile up and pull the mean",
@@ -97,8 +97,10 @@ def clamped(case: Case) -> Iterator[Finding]:
 def several_modes(case: Case) -> Iterator[Finding]:
     """Clouds of at least 5 % of the weight each (`core.modes`), between which the mean lies.
 
-    A warning where the mean is where nobody is: of as many independent particles as the effective sample size says, a
-    normal cloud has a tenth within χ²'s quantile of 0.1 about its mean; how few do is binomial.
+    A note, which is no alarm; of 800 normal clouds of 200 and 1000 particles in 2 and 3 dimensions (200 of each, seeds
+    0 to 199) none has two. A warning where the mean is where nobody is: of as many independent particles as the
+    effective sample size says, a normal cloud has a tenth within χ²'s quantile of 0.1 about its mean; how few do is
+    binomial.
     """
     run = case.run
     apart: list[int] = []

@@ -28,7 +28,8 @@ def ranked(found: list[Finding]) -> list[Finding]:
         found = [_softened(f, best) if other else f for f, other in zip(found, others, strict=True)]
     found = [_of_the_noise(f, found) if f.code == "start" else f for f in found]
     errors = [f for f in found if f.severity == "error" and f.code != "sensor_silent"]
-    return [_softened(f, next((c for c in errors if _follows(f, c)), None)) for f in found]
+    first = sorted(errors, key=lambda finding: finding.tier)  # the cause at the root is what is to be mended
+    return [_softened(f, next((c for c in first if _follows(f, c)), None)) for f in found]
 
 
 def _of_the_noise(start: Finding, found: list[Finding]) -> Finding:

@@ -200,7 +200,8 @@ def _left_of(run: Run, one: Given, without: Sequence[tuple[int, int]]) -> Given:
 
 
 def biased_at_rest(run: Run) -> Iterator[Finding]:
-    """A gyro that reads a rate while it lies still: its mean over the prefix's first half, by a t-test.
+    """A gyro that reads a rate while it lies still: its mean over the prefix's first half, by a t-test. Large is more
+    than the noise of one reading.
 
     Only where its readings are white, as those of a body at rest are.
     """
@@ -213,23 +214,36 @@ def biased_at_rest(run: Run) -> Iterator[Finding]:
     rest = both.rate[:still]
     about = rest - rest.mean(0)
     rho = (about[1:] * about[:-1]).sum(0) / np.maximum((about**2).sum(0), 1e-300)
-    if (np.abs(rho) > 3 / np.sqrt(still)).any() or np.abs(rest.mean(0)).max() > _RESTING:
-        return  # readings that follow one another: it turns, however slowly
+    fast = np.abs(rest.mean(0)).max() > _RESTING and not _belied(both, rest.mean(0), run, still)
+    if (np.abs(rho) > 3 / np.sqrt(still)).any() or fast:
+        return  # readings that follow one another, or too large: it turns, however slowly
     error = rest.std(0, ddof=1) / np.sqrt(still)
     score = rest.mean(0) / np.where(error > 0, error, np.inf)
     worst = int(np.argmax(np.abs(score)))
     p = float(2 * t.sf(abs(score[worst]), still - 1))
-    severity = judge(p, 3, large=False)
+    beyond = max(abs(float(rest.mean(0)[worst])) - float(rest.std(0, ddof=1)[worst]), 0.0) / float(error[worst])
+    severity = judge(p, 3, large=float(2 * t.sf(beyond, still - 1)))
     if severity:
         value, axis = float(rest.mean(0)[worst]), "xyz"[worst]
         steps = int(run.step[both.rows[0]]), int(run.step[both.rows[still - 1]])
-        evidence = {"component": axis, "mean": value, "z": float(score[worst]), "p": p}
+        evidence = {"component": axis, "bias": value, "z": float(score[worst]), "p": p}
         yield Finding(
             "biased_innovation", severity, "gyro", steps, evidence,
             f"lying still, the gyro's {axis} reads {value:+.2g} rad/s ({np.degrees(value) * 30:+.1f}° in 30 s): its "
             "bias is not what was subtracted, as when it is read off by the median of whole counts",
             "subtract the mean of the still prefix, not the median, and no constant from another day",
         )  # fmt: skip
+
+
+def _belied(both: Imu, rate: Array, run: Run, still: int) -> bool:
+    """Whether gravity stays where it is, though a rate (3,) would have turned it over `still` readings by far more than
+    the accelerometer's noise."""
+    force = both.force[:still] / np.linalg.norm(both.force[:still], axis=1, keepdims=True)
+    first, last = force[: still // 2], force[still // 2 :]
+    span = float(run.time[both.rows[still - 1]] - run.time[both.rows[0]])
+    would = float(np.linalg.norm(np.cross(rate, force.mean(0)))) * 0.5 * span
+    noise = float(force.std(0).max()) * 2 / np.sqrt(still / 2)
+    return would > 5 * (float(np.linalg.norm(last.mean(0) - first.mean(0))) + noise)
 
 
 def runs(flags: np.ndarray) -> list[tuple[int, int]]:

@@ -24,27 +24,42 @@ from viz_estim.recording.tables import StageTable
 
 _BACK = 3  # readings over which a rate of change is taken: backwards, so that it is known before the innovation
 _STRETCHES = 20
-_EXPLAINS = 0.2  # of the innovations' excess over what they should be, at least, for a fault to be named as its cause
+# Of the innovations' excess over what they should be, at least, for a fault to be named as its cause. It chooses among
+# causes; of false alarms it can but take some away.
+_EXPLAINS = 0.2
 
 
 class Fault(NamedTuple):
-    """A fault's sensor (`range/1`), what it is, its estimated size, its score, and the chance of such a score."""
+    """A fault's sensor (`range/1`), what it is, its estimated size, its score, and the score by stretches with its
+    degrees of freedom, 0 where it is not needed."""
 
     sensor: str
     kind: str
     size: float
     score: float
-    p: float
+    by_stretch: float = 0.0
+    dof: int = 0
+
+    @property
+    def p(self) -> float:
+        """The chance of such a score where there is no fault."""
+        return self.p_beyond(0.0)
+
+    def p_beyond(self, size: float) -> float:
+        """The chance of such a score where the fault is of this size."""
+        share = max(0.0, 1 - size / max(abs(self.size), 1e-300))
+        p = 2 * norm.sf(share * abs(self.score))
+        return float(max(p, 2 * t.sf(share * self.by_stretch, self.dof)) if self.dof else p)
 
 
 def lags(case: Case) -> Iterator[Finding]:
-    """A constant lag τ of a sensor: its readings are z(t − τ), off by −τ·ż."""
+    """A constant lag τ of a sensor: its readings are z(t − τ), off by −τ·ż. Large is more than half of a step."""
     found = _tested(case, "lag")
     excess = _excess(case)
     for fault in found:
-        severity = judge(fault.p, len(found), large=True)
         tau, name = fault.size, fault.sensor
         interval = float(np.median(np.diff(case.run.time)))
+        severity = judge(fault.p, len(found), large=fault.p_beyond(0.5 * interval))
         if severity is None or fault.score**2 < _EXPLAINS * excess or abs(tau) < interval:
             continue  # less than a step is how the model takes its steps
         if abs(tau) > 0.1 * (case.run.time[-1] - case.run.time[0]):
@@ -60,17 +75,20 @@ def lags(case: Case) -> Iterator[Finding]:
 
 
 def biases(case: Case) -> Iterator[Finding]:
-    """A constant bias of one component of a sensor, also where the state soaks up most of it."""
+    """A constant bias of one component of a sensor, also where the state soaks up most of it.
+
+    Large is one that doubles the squared error with which the filter foresees the reading, as in `innovations.biased`.
+    """
     found = _tested(case, "bias")
     excess = _excess(case)
     told = set()
     for fault in sorted(found, key=lambda one: -abs(one.score)):
         name = fault.sensor.partition("/")[0]
-        severity = judge(fault.p, len(found), large=True)
+        axis, unit = fault.kind.removeprefix("bias ").partition(" ")[::2]
+        severity = judge(fault.p, len(found), large=fault.p_beyond(_foreseen(case, name, axis)))
         if severity is None or name in told or fault.score**2 < _EXPLAINS * excess:
             continue
         told.add(name)
-        axis, unit = fault.kind.removeprefix("bias ").partition(" ")[::2]
         known = parameter(case.run, f"{name}_bias")
         remedy = (
             f"set {known[0]}=estimate"
@@ -84,6 +102,15 @@ def biases(case: Case) -> Iterator[Finding]:
             "the state soaks up in part",
             remedy,
         )  # fmt: skip
+
+
+def _foreseen(case: Case, name: str, axis: str) -> float:
+    """√(H·P·Hᵀ) of a sensor's component, in the mean: how well the filter foresees what it would read without noise."""
+    readings = case.sensors.get(name)
+    if readings is None:
+        return 0.0
+    i = readings.space.axes.index(axis) if axis in readings.space.axes else 0
+    return max(float(np.mean(readings.cov[:, i, i] - readings.noise[:, i, i])), 0.0) ** 0.5
 
 
 def _excess(case: Case) -> float:
@@ -159,10 +186,9 @@ def _estimated(name: str, kind: str, A: Array, b: Array, misfit: float) -> Fault
     used = int((A > 0).sum())
     rest = (b - size * A)[A > 0]
     variance = float(np.square(rest).sum() * used / max(used - 1, 1))
-    p = 2 * norm.sf(abs(score))
     if variance > A.sum() * misfit * chi2.isf(0.01, max(used - 1, 1)) / max(used - 1, 1):
-        p = max(p, 2 * t.sf(abs(b.sum()) / np.sqrt(variance), max(used - 1, 1)))
-    return Fault(name, kind, float(size), score, float(p))
+        return Fault(name, kind, float(size), score, float(abs(b.sum()) / np.sqrt(variance)), max(used - 1, 1))
+    return Fault(name, kind, float(size), score)
 
 
 def _misfit(case: Case) -> float:

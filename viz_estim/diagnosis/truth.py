@@ -13,45 +13,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viz_estim.core.distributions import chi2, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean, Product, Space
 from viz_estim.diagnosis.axes import explains, maps, units
 from viz_estim.diagnosis.evidence import Case, jacobians, parameter, tells_gain, tells_reading
-from viz_estim.diagnosis.finding import Finding, judge
+from viz_estim.diagnosis.finding import GROSS, Finding, judge
+from viz_estim.diagnosis.fits import Against, fitted, white
 
 FEWEST = 30
-STRETCHES = 20
 _TURNED = 0.1  # rad
 SURELY = 0.95  # of the misfit explained: no error of a linearisation looks like that
-_SMALL, _LARGE = 0.1, 0.5  # of R's standard deviation
+_SMALL = 0.1  # of R's standard deviation: what a hundred readings would tell
 _NEAR = 0.1  # a factor is that of a known unit, or −1, within a tenth
 
 
-class Against(NamedTuple):
-    """A sensor's M readings against the truth: z (M, n), what the truth would give (M, n), r (M, m), R (M, m, m).
-
-    slip (M,) bounds the error of r by the linearisation, in standard deviations of R.
-    """
-
-    name: str
-    space: Space
-    step: np.ndarray
-    time: Array
-    z: Array
-    true: Array
-    r: Array
-    noise: Array
-    slip: Array
-
-
 class Cause(NamedTuple):
-    """What would explain r: its gain in log-likelihood for k parameters, its p, its size in σ, and how to say it."""
+    """What would explain r: its gain in log-likelihood for k parameters, its p, whether it is large or the p of that
+    (`finding.judge`), its size in σ, and how to say it."""
 
     code: str
     gain: float
     k: int
     p: float
+    large: bool | float
     size: float
     explained: float
     evidence: dict[str, object]
@@ -65,7 +49,8 @@ def sensors(case: Case) -> Iterator[Finding]:
 
     Each is fitted to r by least squares in R; of those that are significant the one with the largest gain in
     log-likelihood less ½·k·log M is told (Schwarz 1978). p is of the t-test of the worst coefficient with a variance
-    by 20 stretches of the run (Liang and Zeger 1986), so that truth and noise may be coloured.
+    by 20 stretches of the run (Liang and Zeger 1986), so that truth and noise may be coloured. Large is a bias or a
+    factor that doubles the squared error with which the filter foresees the reading, and a lag beyond half of a step.
     """
     against = list(_against(case))
     tests = sum(len(one.space.axes) + 2 for one in against)
@@ -73,9 +58,9 @@ def sensors(case: Case) -> Iterator[Finding]:
     for one in against:
         name = one.name.partition("/")[0]
         causes = [c for c in (*_maps(one), _bias(one), _lag(case, one)) if c is not None]
-        found = [(c, judge(c.p, tests, large=c.size > _LARGE)) for c in causes]
+        found = [(c, judge(c.p, tests, large=c.large)) for c in causes]
         slip = 2 * float(np.median(one.slip))
-        found = [(c, s) for c, s in found if s and (c.size > max(slip, _SMALL) or (c.explained > SURELY and c.known))]
+        found = [(c, s) for c, s in found if s and c.size > max(slip, _SMALL)]
         if not found or name in told:
             continue
         best, severity = max(found, key=lambda entry: entry[0].gain - 0.5 * entry[0].k * np.log(len(one.step)))
@@ -124,8 +109,14 @@ def _against(case: Case) -> Iterator[Against]:
             if near.sum() >= FEWEST:
                 yield Against(
                     name, part, table.step[rows][near], run.time[at[rows]][near],
-                    table.values["innovation.z"][rows][:, place][near], true[near], r[near], R[rows][near], off[near],
+                    table.values["innovation.z"][rows][:, place][near], true[near], r[near], R[rows][near],
+                    _spread(H[rows][:, axes], cov[rows])[near], off[near],
                 )  # fmt: skip
+
+
+def _spread(H: Array, P: Array) -> Array:
+    """(H·P·Hᵀ)ᵢᵢ (M, m) of H (M, m, d) and P (M, d, d)."""
+    return np.asarray(np.maximum(np.einsum("tmi,tij,tmj->tm", H, P, H), 0.0))
 
 
 def slip(J: Array, error: Array, mean: Array, space: Space) -> Array:
@@ -152,56 +143,17 @@ def slip(J: Array, error: Array, mean: Array, space: Space) -> Array:
     return np.asarray(0.5 * L * (e**2 / size**2).sum(1))
 
 
-def _white(one: Against, values: Array) -> Array:
-    """L⁻¹·v of values (M, m) or (M, m, k), R = L·Lᵀ."""
-    flat = values.ndim == 2
-    solved = np.linalg.solve(np.linalg.cholesky(one.noise), values[..., None] if flat else values)
-    return np.asarray(solved[..., 0] if flat else solved)
-
-
-class _Fitted(NamedTuple):
-    coefficients: Array
-    p: Array
-    gain: float
-    explained: float
-
-
-def _fit(one: Against, design: Array) -> _Fitted:
-    """r (M, m) on a design (M, m, k) by least squares in R; explained: the share of Σ|r|² beyond what noise is."""
-    X, y = _white(one, design), _white(one, one.r)
-    M, m, k = X.shape
-    A = np.einsum("tmi,tmj->ij", X, X)
-    if not np.isfinite(A).all() or np.linalg.matrix_rank(A) < k:
-        return _Fitted(np.zeros(k), np.ones(k), 0.0, 0.0)
-    beta = np.linalg.solve(A, np.einsum("tmi,tm->i", X, y))
-    left = y - X @ beta
-    scores = np.einsum("tmi,tm->ti", X, left)
-    pieces = np.array([part.sum(0) for part in np.array_split(scores, min(STRETCHES, M // 5))])
-    B = len(pieces)
-    inverse = np.linalg.inv(A)
-    robust = inverse @ (pieces.T @ pieces) @ inverse * B / (B - 1)
-    model = inverse * max(1.0, float((left**2).mean()))
-    error = np.sqrt(np.maximum(np.diag(robust), np.diag(model)))
-    p = 2 * t.sf(np.abs(beta) / np.maximum(error, 1e-300), B - 1)
-    # Where the scatter over stretches is no larger than the noise's own, this is normal: a t of 19 would waste power.
-    plain = np.diag(robust) < np.diag(model) * chi2.isf(0.01, B - 1) / (B - 1)
-    p = np.where(plain, 2 * t.sf(np.abs(beta) / np.sqrt(np.diag(model)), M - k), p)
-    own, rest = float((y**2).sum()), float((left**2).sum())
-    # In the least variance that explains the rest, so that an R that is too small does not count for a cause.
-    gain = 0.5 * M * m * np.log(own / max(rest, 1e-300))
-    return _Fitted(beta, p, gain, (own - rest) / max(own - min(M * m, rest), 1e-300))
-
-
 def _bias(one: Against) -> Cause | None:
     m = one.r.shape[1]
-    fit = _fit(one, np.broadcast_to(np.eye(m), (len(one.r), m, m)))
+    fit = fitted(one, np.broadcast_to(np.eye(m), (len(one.r), m, m)))
     size = np.abs(fit.coefficients) / np.sqrt(np.median(np.diagonal(one.noise, axis1=1, axis2=2), axis=0))
     worst = int(np.argmax(-fit.p + 1e-9 * size))
     name, axis, unit = one.name, one.space.axes[worst], one.space.axis_units[worst]
     label = name if axis in ("", name.partition("/")[0]) else f"{name} {axis}"
     value = float(fit.coefficients[worst])
     return Cause(
-        "biased_innovation", fit.gain, m, float(fit.p[worst]), float(size[worst]), fit.explained,
+        "biased_innovation", fit.gain, m, float(fit.p[worst]),
+        fit.p_beyond(worst, float(np.sqrt(np.mean(one.foreseen[:, worst])))), float(size[worst]), fit.explained,
         {"component": axis, "bias": value, "mean_sigma": float(size[worst])},
         f"against the truth, readings of {label} are {value:+.3g} {unit} off on the average: the sensor has a bias "
         "that the filter does not know of",
@@ -218,24 +170,26 @@ def _lag(case: Case, one: Against) -> Cause | None:
     middle = Against(*(v[1:-1] if isinstance(v, np.ndarray) else v for v in one))  # type: ignore[arg-type]
     m = rate.shape[1]
     design = np.concatenate([-rate[..., None], np.broadcast_to(np.eye(m), (len(rate), m, m))], axis=-1)
-    both, alone = _fit(middle, design), _fit(middle, design[..., :1])
+    both, alone = fitted(middle, design), fitted(middle, design[..., :1])
     # A constant beside it costs power where the way is straight; it is fitted only where there is one.
-    p, tau = float(alone.p[0]), float(alone.coefficients[0])
-    if both.p[1:].min() < 0.05:
-        p, tau = float(both.p[0]), float(both.coefficients[0])
+    fit = both if both.p[1:].min() < 0.05 else alone
+    p, tau = float(fit.p[0]), float(fit.coefficients[0])
     interval = float(np.median(np.diff(case.run.time)))
-    shift = float(np.sqrt(np.mean(_white(middle, tau * rate) ** 2)))
+    shift = float(np.sqrt(np.mean(white(middle, tau * rate) ** 2)))
     if abs(tau) < 0.5 * interval:
         return None
     late = "late" if tau > 0 else "early"
+    place = set(one.space.axis_units) == {"m"} and len(one.space.axes) > 1
+    where = "behind" if tau > 0 else "ahead of"
+    alike = f"; or it sits {where} what moves, which looks alike at one speed" if place else ""
     readings = float(np.median(np.diff(one.time)))
     if abs(tau) > 0.1 * (one.time[-1] - one.time[0]):
         return None  # so long a lag is no matter of a rate
     return Cause(
-        "lag", alone.gain, 1, p, max(shift, _LARGE * 1.01), alone.explained,
+        "lag", alone.gain, 1, p, fit.p_beyond(0, 0.5 * interval), shift, alone.explained,
         {"lag_s": tau, "lag_samples": tau / readings},
         f"against the truth, readings of {one.name} come {abs(tau):.3g} s {late} ({abs(tau) / readings:.1f} of its "
-        "samples): a delay of the sensor or of the truth, another clock, or an index that is one off",
+        f"samples): a delay of the sensor or of the truth, another clock, or an index that is one off{alike}",
         f"pair {one.name} by its stamps and not by index; correct its stamps by {-tau:+.3g} s",
     )  # fmt: skip
 
@@ -244,27 +198,31 @@ def _maps(one: Against) -> Iterator[Cause]:
     """The best signed permutation or unit, and the best plain factor."""
     if not isinstance(one.space, Euclidean) or not 1 <= len(one.space.axes) <= 3:
         return
-    own = float((_white(one, one.r) ** 2).sum())
+    own = float((white(one, one.r) ** 2).sum())
     M, m = one.r.shape
     best, what = np.inf, ""
     for title, A in maps(m, one.space.axis_units[0]):
-        left = float((_white(one, one.z @ A.T - one.true) ** 2).sum()) / max(1.0, abs(np.linalg.det(A)) ** (2 / m))
+        left = float((white(one, one.z @ A.T - one.true) ** 2).sum()) / max(1.0, abs(np.linalg.det(A)) ** (2 / m))
         if left < best:
             best, what = left, title
     gain, explained = 0.5 * M * m * np.log(own / max(best, 1e-300)), 1 - best / max(own, 1e-300)
-    if explains(what, explained) and np.sqrt(own / best) > 1.5:
+    if explains(what, explained) and own > GROSS * best:
         words = f"the readings as {what}" if what.startswith("axes") else f"a factor ({what})"
         yield Cause(
-            "units_or_axes", gain, 1, float(np.exp(-min(gain, 700.0))) * 60, float(np.sqrt(own / (M * m))), explained,
+            "units_or_axes", gain, 1, float(np.exp(-min(gain, 700.0))) * 60, True, float(np.sqrt(own / (M * m))),
+            explained,
             {"map": what, "log_likelihood_gain": gain},
             f"{words} would explain {explained:.0%} of what {one.name} and the truth disagree on",
             f"check the order, the signs and the unit of {one.name}: the best map is `{what}`", True,
         )  # fmt: skip
-    fit = _fit(one, one.true[..., None])
+    fit = fitted(one, one.true[..., None])
     factor = 1 + float(fit.coefficients[0])
-    size = float(np.sqrt(np.mean(_white(one, (factor - 1) * one.true) ** 2)))
+    unit_size = float(np.sqrt(np.mean(white(one, one.true) ** 2)))
+    size = abs(factor - 1) * unit_size
+    foreseen = float(np.sqrt(np.mean(one.foreseen / np.diagonal(one.noise, axis1=1, axis2=2))))
     yield Cause(
-        "units_or_axes", fit.gain, 1, float(fit.p[0]), size, fit.explained, {"map": f"a factor of {factor:.4g}"},
+        "units_or_axes", fit.gain, 1, float(fit.p[0]), fit.p_beyond(0, foreseen / max(unit_size, 1e-300)), size,
+        fit.explained, {"map": f"a factor of {factor:.4g}"},
         f"readings of {one.name} are {factor:.4g}× what the truth would give: {named(factor, one.space.axis_units[0])}",
         f"divide the readings of {one.name} by {factor:.4g}, or calibrate its scale",
     )  # fmt: skip
@@ -272,6 +230,8 @@ def _maps(one: Against) -> Iterator[Cause]:
 
 def named(factor: float, unit: str) -> str:
     """What a factor of a reading may come from."""
+    if abs(factor / 2 - 1) < _NEAR:
+        return "twice, as a round trip taken for the way there"
     known = [title for title, value in units(unit).items() if abs(factor * value - 1) < _NEAR]
     if known:
         return known[0]

@@ -26,15 +26,25 @@ _PLACES = 4000  # stages at most, from the first that counts on: of a thousand r
 
 
 class Tuned(NamedTuple):
-    """The factor on a noise that explains the innovations best, and its gain in log-likelihood against 1."""
+    """The factor on a noise that explains the innovations best, its gain in log-likelihood against 1, and the
+    log-likelihoods of the factors that were tried."""
 
     factor: float
     gain: float
+    scores: Array
 
     @property
     def known(self) -> bool:
         """Whether it is a number, and not the end of those that were tried."""
         return abs(np.log(self.factor)) < 0.95 * _GRID[-1]
+
+    def p_beyond(self, factor: float) -> float:
+        """The chance of such innovations if the noise is too small by `factor` and not by more (Wilks 1938)."""
+        if self.factor <= factor:
+            return 1.0
+        fine, values = _spline(self.scores)
+        held = float(values[np.searchsorted(fine, np.log(factor))])
+        return float(0.5 * chi2.sf(2 * max(float(values.max()) - held, 0.0), 1))
 
 
 def factors(case: Case) -> dict[str, Tuned]:
@@ -65,7 +75,7 @@ def _factors(case: Case) -> dict[str, Tuned]:
     for i, kind in enumerate(kinds):
         of = scores[i * len(_GRID) : (i + 1) * len(_GRID)]
         at, best = _peak(of)
-        found[kind] = Tuned(float(np.exp(at)), float(best - of[len(_GRID) // 2]))
+        found[kind] = Tuned(float(np.exp(at)), float(best - of[len(_GRID) // 2]), of)
     return found
 
 
@@ -77,10 +87,15 @@ def _parts(table: StageTable) -> dict[str, slice]:
 
 def _peak(scores: Array) -> tuple[float, float]:
     """Where a cubic spline through the scores of the grid has its top, and how high that is."""
-    fine = np.linspace(_GRID[0], _GRID[-1], 40 * (len(_GRID) - 1) + 1)
-    values = CubicSpline(_GRID, np.nan_to_num(scores, nan=-1e300, neginf=-1e300))(fine)
+    fine, values = _spline(scores)
     k = int(np.argmax(values))
     return float(fine[k]), float(values[k])
+
+
+def _spline(scores: Array) -> tuple[Array, Array]:
+    """Log factors, forty to each step of the grid, and a cubic spline through the grid's scores there."""
+    fine = np.linspace(_GRID[0], _GRID[-1], 40 * (len(_GRID) - 1) + 1)
+    return fine, np.asarray(CubicSpline(_GRID, np.nan_to_num(scores, nan=-1e300, neginf=-1e300))(fine))
 
 
 def _scores(

@@ -260,6 +260,14 @@ def noise_too_small_for_particles(data: BeaconData) -> Scenario:
     return beacons.beacons_pf(data, particles=300, range_noise=0.1, speed_noise=0.105, turn_noise=0.09)
 
 
+@_flaw("process_model", beacons)
+def turns_the_wrong_way(data: BeaconData) -> Scenario:
+    """The sign of the turn rate that drives the particles is wrong."""
+    healthy = beacons.beacons_pf(data)
+    ticks = [replace(t, control=None if t.control is None else t.control * [1.0, -1.0]) for t in healthy.ticks]
+    return replace(healthy, ticks=ticks)
+
+
 @_flaw("icp_few_matches", scan)
 def max_distance_too_small(data: ScanData) -> Scenario:
     """Points further apart than a five centimetres are no match, and the clouds are."""

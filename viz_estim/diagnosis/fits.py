@@ -1,0 +1,82 @@
+"""Least squares of what a sensor's readings miss the truth by, with standard errors that hold where it is coloured."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from viz_estim.core.distributions import chi2, t
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import Space
+
+STRETCHES = 20
+
+
+class Against(NamedTuple):
+    """A sensor's M readings against the truth: z (M, n), what the truth would give (M, n), r (M, m), R (M, m, m).
+
+    foreseen (M, m) is the variance of the truth's reading by the filter's prediction, (H·P·Hᵀ)ᵢᵢ; slip (M,) bounds the
+    error of r by the linearisation, in standard deviations of R.
+    """
+
+    name: str
+    space: Space
+    step: np.ndarray
+    time: Array
+    z: Array
+    true: Array
+    r: Array
+    noise: Array
+    foreseen: Array
+    slip: Array
+
+
+def white(one: Against, values: Array) -> Array:
+    """L⁻¹·v of values (M, m) or (M, m, k), R = L·Lᵀ."""
+    flat = values.ndim == 2
+    solved = np.linalg.solve(np.linalg.cholesky(one.noise), values[..., None] if flat else values)
+    return np.asarray(solved[..., 0] if flat else solved)
+
+
+class Fitted(NamedTuple):
+    """A fit's coefficients (k,), their p against 0, the standard errors and degrees of freedom (k,) of that test, its
+    gain in log-likelihood, and the share that it explains."""
+
+    coefficients: Array
+    p: Array
+    error: Array
+    dof: Array
+    gain: float
+    explained: float
+
+    def p_beyond(self, i: int, size: float) -> float:
+        """The chance of such a coefficient where it is of this size."""
+        beyond = max(abs(float(self.coefficients[i])) - size, 0.0)
+        return float(2 * t.sf(beyond / max(float(self.error[i]), 1e-300), self.dof[i]))
+
+
+def fitted(one: Against, design: Array) -> Fitted:
+    """r (M, m) on a design (M, m, k) by least squares in R; explained: the share of Σ|r|² beyond what noise is."""
+    X, y = white(one, design), white(one, one.r)
+    M, m, k = X.shape
+    A = np.einsum("tmi,tmj->ij", X, X)
+    if not np.isfinite(A).all() or np.linalg.matrix_rank(A) < k:
+        return Fitted(np.zeros(k), np.ones(k), np.ones(k), np.ones(k), 0.0, 0.0)
+    beta = np.linalg.solve(A, np.einsum("tmi,tm->i", X, y))
+    left = y - X @ beta
+    scores = np.einsum("tmi,tm->ti", X, left)
+    pieces = np.array([part.sum(0) for part in np.array_split(scores, min(STRETCHES, M // 5))])
+    B = len(pieces)
+    inverse = np.linalg.inv(A)
+    robust = inverse @ (pieces.T @ pieces) @ inverse * B / (B - 1)
+    model = inverse * max(1.0, float((left**2).mean()))
+    error = np.sqrt(np.maximum(np.diag(robust), np.diag(model)))
+    # Where the scatter over stretches is no larger than the noise's own, this is normal: a t of 19 would waste power.
+    plain = np.diag(robust) < np.diag(model) * chi2.isf(0.01, B - 1) / (B - 1)
+    error, dof = np.where(plain, np.sqrt(np.diag(model)), error), np.where(plain, M - k, B - 1)
+    p = 2 * t.sf(np.abs(beta) / np.maximum(error, 1e-300), dof)
+    own, rest = float((y**2).sum()), float((left**2).sum())
+    # In the least variance that explains the rest, so that an R that is too small does not count for a cause.
+    gain = 0.5 * M * m * np.log(own / max(rest, 1e-300))
+    return Fitted(beta, p, error, dof, gain, (own - rest) / max(own - min(M * m, rest), 1e-300))
