@@ -38,5 +38,5 @@ def test_it_is_scipy_s(name: str) -> None:
 
 
 def test_far_in_the_tail_of_f_the_inverse_is_one() -> None:
-    p, k, m = np.array([1e-300, 1e-12, 1e-9]), DOF[1:], DOF[::-1][:-1]
+    p, k, m = np.array([1e-60, 1e-12, 1e-9]), DOF[1:], DOF[::-1][:-1]
     np.testing.assert_allclose(distributions.f.sf(distributions.f.isf(p, k, m), k, m), p * np.ones_like(k), rtol=1e-9)

@@ -116,3 +116,10 @@ def normal(space: Space, mean: Array, cov: Array, rng: np.random.Generator) -> A
         values, vectors = np.linalg.eigh(cov)
         root = vectors * np.sqrt(np.maximum(values, 0))[..., None, :]
     return space.plus(mean, (root @ white)[..., 0])
+
+
+def read_only(values: Array) -> Array:
+    """The same numbers, to be shown to a person's model: one that writes into them would change what is recorded."""
+    shown = values.view()
+    shown.flags.writeable = False
+    return shown

@@ -86,6 +86,7 @@ class DiscreteFilter:
     transition T (K, K) is from one tick to the next, however long that takes; sensors as in `update`.
     """
 
+    pure = True
     transition: Array
     sensors: Mapping[str, Array]
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from viz_estim.core.beliefs import Gaussian, normal
+from viz_estim.core.beliefs import Gaussian, normal, read_only
 from viz_estim.core.measurement import Measurement, Sensor, gain, symmetrised, transposed
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick
@@ -79,6 +79,7 @@ class KalmanFilter:
     tick.dt. The stage of a filter's only sensor is `update`, those of several are `update/NAME`.
     """
 
+    pure = True
     process: Callable[[Array, Tick], Array]
     jacobian: Callable[[Array, Tick], Array]
     process_noise: Callable[[Array, Tick], Array]
@@ -91,7 +92,7 @@ class KalmanFilter:
 
     def step(self, belief: Gaussian, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
         if tick.dt > 0:
-            x = belief.mean
+            x = read_only(belief.mean)
             stage: Stage = predict(belief, self.process(x, tick), self.jacobian(x, tick), self.process_noise(x, tick))
             yield stage
             belief = stage.belief

@@ -58,6 +58,7 @@ class Painter:
     step to the one after it.
     """
 
+    pure = True
     filter: Estimator
     camera: Camera
 

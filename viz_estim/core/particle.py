@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from viz_estim.core.beliefs import Particles
+from viz_estim.core.beliefs import Particles, read_only
 from viz_estim.core.discrete import LOG_ZERO
 from viz_estim.core.quaternions import Array
 from viz_estim.core.resampling import METHODS, Method
@@ -36,7 +36,9 @@ def predict(
     belief: Particles, propagate: Propagate, tick: Tick, rng: np.random.Generator, *, name: str = "predict"
 ) -> Predict:
     """The belief after each particle is drawn anew from the process model, p(x' | x): the weights stay."""
-    return Predict(name, Particles(belief.space, propagate(belief.states, tick, rng), belief.log_weights))
+    shown = read_only(belief.states)
+    moved = propagate(shown, tick, rng)
+    return Predict(name, Particles(belief.space, belief.states if moved is shown else moved, belief.log_weights))
 
 
 @names_its_failures
@@ -45,7 +47,7 @@ def weigh(belief: Particles, log_likelihood: LogLikelihood, tick: Tick, *, name:
 
     ArithmeticError where no particle can give the readings.
     """
-    log_likelihoods = np.maximum(log_likelihood(belief.states, tick), LOG_ZERO)  # log 0 is a number here
+    log_likelihoods = np.maximum(log_likelihood(read_only(belief.states), tick), LOG_ZERO)  # log 0 is a number here
     log_weights = belief.log_weights + log_likelihoods
     best = np.maximum.reduce(log_weights, axis=-1, keepdims=True)
     if not (best > LOG_ZERO / 2).all():  # nor NaN
@@ -104,6 +106,7 @@ class ParticleFilter:
     of N; at 1 always.
     """
 
+    pure = True
     propagate: Propagate
     log_likelihood: LogLikelihood
     resampling: Method = "systematic"

@@ -163,6 +163,8 @@ def align(belief: Gaussian, X: Array, matches: Matches, *, name: str = "align") 
 class ClosestPoints:
     """An estimator: one iteration a step, at ticks with a dt; it takes cloud X (N, d) on to cloud Y (M, d), in m."""
 
+    pure = True
+
     def __init__(self, X: Array, Y: Array, max_distance: float) -> None:
         self.X, self.max_distance = X, max_distance
         self._tree = cKDTree(Y)

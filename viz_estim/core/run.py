@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
@@ -41,7 +43,11 @@ class Tick:
 
 
 class Estimator(Protocol):
-    """Turns a belief and a tick into the stages of a step; the belief is all that it carries on."""
+    """Turns a belief and a tick into the stages of a step; the belief is all that it carries on.
+
+    One that says `pure = True` never writes into an array that it was given or has yielded. Of others, which may well
+    say `x += K @ y`, each belief and stage is copied as it comes and goes.
+    """
 
     def step(self, belief: Belief, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]: ...
 
@@ -118,6 +124,7 @@ def run(scenario: Scenario, seed: int = 0, *, first: int = 0, belief: Belief | N
     first, belief: to begin with that step, given what was believed before it; the steps are then the whole run's.
     """
     chance = Chance(seed)
+    pure = getattr(scenario.estimator, "pure", False)
     # A person's own kind of belief may lack them: then its first stage says so.
     shapes: Mapping[str, tuple[int, ...]] = getattr(scenario.beliefs[0], "shapes", {})
     for k in range(first, len(scenario.ticks)):
@@ -129,8 +136,9 @@ def run(scenario: Scenario, seed: int = 0, *, first: int = 0, belief: Belief | N
             stages.append(Start("start", belief))
         assert belief is not None, "a scenario sets a belief at step 0"
         try:
-            for stage in scenario.estimator.step(belief, tick, chance.at(k)):
-                _check_shapes(stage, shapes)
+            for made in scenario.estimator.step(belief if pure else _own(belief), tick, chance.at(k)):
+                _check_shapes(made, shapes)
+                stage = made if pure else _own(made)
                 stages.append(stage)
                 before, belief = belief, stage.belief
                 for name in shapes:
@@ -138,12 +146,26 @@ def run(scenario: Scenario, seed: int = 0, *, first: int = 0, belief: Belief | N
                         raise NotFinite("the belief is no longer finite")
         except Exception as failure:  # whatever a person's filter raises is what they came to see
             text = f"{type(failure).__name__}: {failure}"
+            if "read-only" in text:
+                text += "; what a model is given is recorded too: write x = x + d for x += d, or work on x.copy()"
             error = Failure(k, _failing_stage(stages, failure), text)
         truth = None if scenario.truth is None else scenario.truth[k]
         step = Step(k, tick, tuple(stages), truth, error)
         yield step
         if error or (scenario.until and scenario.until(step)):
             return
+
+
+def _own(value: Any) -> Any:
+    """A belief, a stage or what they hold, with arrays of its own; what was worked out from them is forgotten."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return value
+    owned = copy.copy(value)
+    for one in dataclasses.fields(value):
+        object.__setattr__(owned, one.name, _own(getattr(value, one.name)) if one.init else one.default)
+    return owned
 
 
 def _finite(values: Array, before: Array) -> bool:

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viz_estim.core.beliefs import Gaussian, normal
+from viz_estim.core.beliefs import Gaussian, normal, read_only
 from viz_estim.core.measurement import Measurement, Sensor, gain, symmetrised, transposed
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick
@@ -83,7 +83,7 @@ def predict(
     move maps states (*, N, n) to states; noise Q (d, d).
     """
     drawn = draw(belief.space, belief.mean, belief.cov + noise, rule)
-    propagated = SigmaPoints(belief.space, move(drawn.points), drawn.mean_weights, drawn.cov_weights)
+    propagated = SigmaPoints(belief.space, move(read_only(drawn.points)), drawn.mean_weights, drawn.cov_weights)
     mean, cov, _ = moments(propagated)
     return UnscentedPredict(name, Gaussian(belief.space, mean, symmetrised(cov)), drawn, propagated)
 
@@ -108,7 +108,8 @@ def predict_augmented(
     mean = np.concatenate([belief.mean, np.zeros((*belief.mean.shape[:-1], q))], axis=-1)
     space: Any = belief.space  # a protocol does not say that it can be hashed
     drawn = draw(_with_noise(space, q), mean, joint, rule)
-    moved = move(drawn.points[..., :n], drawn.points[..., n:])
+    points = read_only(drawn.points)
+    moved = move(points[..., :n], points[..., n:])
     propagated = SigmaPoints(belief.space, moved, drawn.mean_weights, drawn.cov_weights)
     mean, cov, _ = moments(propagated)
     return UnscentedPredict(name, Gaussian(belief.space, mean, symmetrised(cov)), drawn, propagated)
@@ -138,7 +139,7 @@ def update(
     """
     if sigma is None:
         sigma = draw(belief.space, belief.mean, belief.cov, rule)
-    expected = (measure or measurement.measure)(sigma.points)
+    expected = (measure or measurement.measure)(read_only(sigma.points))
     mapped = SigmaPoints(measurement.space, expected, sigma.mean_weights, sigma.cov_weights)
     R = measurement.noise if noise is None else noise
     predicted, spread, errors = moments(mapped)
@@ -167,6 +168,7 @@ class UnscentedFilter:
     tick is read as that (z, R), and its part counts as not offered.
     """
 
+    pure = True
     process: Callable[[Array, Tick], Array]
     process_noise: Callable[[Tick], Array]
     measurement: Measurement
@@ -208,6 +210,7 @@ class AugmentedFilter:
     `update`, those of several are `update/NAME`.
     """
 
+    pure = True
     process: Callable[[Array, Array, Tick], Array]
     process_noise: Callable[[Tick], Array]
     sensors: Mapping[str, Sensor]

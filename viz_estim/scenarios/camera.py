@@ -143,6 +143,8 @@ def mosaic(
 class _Follower:
     """Takes over what motion capture says, and stands still where that is lost."""
 
+    pure = True
+
     def step(self, belief: Gaussian, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
         q = tick.measurements.get("attitude", belief.mean)
         yield Stage("follow", Gaussian(belief.space, q, belief.cov))

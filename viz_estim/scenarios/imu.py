@@ -197,6 +197,7 @@ def imu_ukf_gyro(
 class GyroIntegrator:
     """q' = q·Exp(ω·dt), the covariance carried by the same turn: P' = Fᵀ P F + (σ·dt)², F = R(Exp(ω·dt))."""
 
+    pure = True
     gyro_noise: float
 
     def step(self, belief: Gaussian, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
