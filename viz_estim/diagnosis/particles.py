@@ -8,7 +8,7 @@ import numpy as np
 
 from viz_estim.core.consistency import squared_distance
 from viz_estim.core.distributions import binom, chi2
-from viz_estim.core.modes import modes, moments
+from viz_estim.core.modes import moments, several
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
 from viz_estim.diagnosis.evidence import Case
@@ -117,7 +117,7 @@ def several_modes(case: Case) -> Iterator[Finding]:
     looked = [at for k, at in enumerate(last.items()) if k % every == 0]
     for step, (_, i, row) in looked:
         states, weights = ends[i].values["states"][row], ends[i].values["log_weights"][row]
-        if np.isfinite(states).all() and np.isfinite(weights).all() and len(modes(run.space, states, weights)) > 1:
+        if np.isfinite(states).all() and np.isfinite(weights).all() and several(run.space, states, weights):
             apart.append(step)
             if _hollow(run.space, states, weights) < level("warning", len(looked)):
                 empty.append(step)
