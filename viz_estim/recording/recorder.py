@@ -68,6 +68,7 @@ class Recorder:
         self._lock = threading.Lock()
         self._failed: Exception | None = None
         self._closed = threading.Event()
+        self._sent = threading.Event()  # a batch waits to be written
         name = str(properties.get("scenario", path.stem))
         # A view belongs to an application id: runs of one scenario share what a person arranges in the viewer.
         plain = re.sub(r"[^A-Za-z0-9_-]+", "-", name)  # Rerun renames others, and says so
@@ -115,6 +116,7 @@ class Recorder:
             # By time here rather than by the timer, where steps are quick enough: two threads would hinder each other.
             if len(self._rows) >= self._limit or now - self._oldest >= 0.9 * self._patience:
                 self._flush()
+                self._sent.set()
 
     def close(self, result: dict[str, Any] | None = None, *, facts: Mapping[str, float] | None = None) -> None:
         """Ends the recording well: the result is kept with it, and the file takes its own name.
@@ -144,6 +146,7 @@ class Recorder:
 
     def _stop(self) -> None:
         self._closed.set()
+        self._sent.set()
         self._timer.join()
         with self._lock:
             self._flush()
@@ -153,16 +156,22 @@ class Recorder:
         self._stream.disconnect()
 
     def _tick(self) -> None:
-        written = 0
-        while not self._closed.wait(self._patience / 8):
+        written, due = 0, self._patience
+        while not self._closed.is_set():
+            # As seldom as can be: each time that this thread wakes costs the filter's some five milliseconds.
+            self._sent.wait(due)
+            self._sent.clear()
             try:
                 with self._lock:
-                    if self._rows and time.monotonic() - self._oldest >= self._patience:
+                    age = time.monotonic() - self._oldest if self._rows else 0.0
+                    if age >= self._patience:
                         self._flush()
+                        age = 0.0
                     places = self._places
                 if places != written:  # to the file, for a kill may come; steps go on meanwhile
                     self._stream.flush()
                     written = places
+                due = self._patience - age
             except Exception as error:  # told at the next step, in the thread that can act on it
                 self._failed = error
                 return
