@@ -157,13 +157,14 @@ def _moves_as(
         evidence: dict[str, object] = {"component": label, "factor": factor, "p": p}
     else:
         severity = judge(p_drift, tests, large=abs(drift) > 0.05 * float(np.abs(told).mean()))
+        rate = f"{unit}²" if unit.endswith("/s") else f"{unit}/s"
         cause = (
-            f"the prediction misses a steady {drift:+.3g} {unit}/s of {label}: the control that moves it has a bias, "
+            f"the prediction misses a steady {drift:+.3g} {rate} of {label}: the control that moves it has a bias, "
             "or a force is missing from the model"
         )
         if left_factor < _ALIKE * left_drift:  # it was always told the same
             cause += f"; or it moves by {1 / (1 + beta):.3g}× what it does, which looks alike at one speed"
-        remedy = f"calibrate that bias ({drift:+.3g} {unit}/s), or add it to the state and let the filter estimate it"
+        remedy = f"calibrate that bias ({drift:+.3g} {rate}), or add it to the state and let the filter estimate it"
         evidence = {"component": label, "drift": drift, "p": p_drift}
     if severity:
         yield share, Finding("process_model", severity, None, steps, evidence | {"against": "truth"}, cause, remedy)

@@ -59,7 +59,7 @@ def _spatial(alone: Alone, scenes: Scenes) -> list[rrb.View]:
     found = []
     for scene, word in _NAMES.items():
         if scene in scenes.runs:
-            truth = ", truth white" if scene[1:] in scenes.truths else ""
+            truth = ", fixed grey" if _registered(alone) else ", truth white" if scene[1:] in scenes.truths else ""
             name = f"{word}: {_shown(alone)} amber{truth}" if scene in (schema.ATTITUDE, schema.WORLD) else word
             found.append(view(scene, [alone], alone, scenes, name, 2.8))
     return found
@@ -67,22 +67,26 @@ def _spatial(alone: Alone, scenes: Scenes) -> list[rrb.View]:
 
 def _shown(alone: Alone) -> str:
     """What stands for the estimate."""
-    stages = alone.run.stages
-    return "moved cloud" if "align" in stages else "particles" if alone.run.properties.get("particles") else "estimate"
+    if _registered(alone):
+        return "moved cloud"
+    return "particles" if alone.run.properties.get("particles") else "estimate"
+
+
+def _registered(alone: Alone) -> bool:
+    return "align" in alone.run.stages
 
 
 def _evidence(alone: Alone) -> list[tuple[str, list[_Plots]]]:
     """Tabs by title, each with its plots, those of one thing together."""
-    return [
-        (title, groups)
-        for title, groups in (
-            ("Innovations", _innovations(alone)),
-            ("Errors", _errors(alone)),
-            ("Belief", _belief(alone)),
-            ("Figures", _figures(alone)),
-        )
-        if groups
+    tabs = [
+        ("Innovations", _innovations(alone)),
+        ("Errors", _errors(alone)),
+        ("Belief", _belief(alone)),
+        ("Figures", _figures(alone)),
     ]
+    if _registered(alone):  # its matches and its RMSE say most
+        tabs.insert(0, tabs.pop())
+    return [(title, groups) for title, groups in tabs if groups]
 
 
 def _innovations(alone: Alone) -> list[_Plots]:
