@@ -1,6 +1,7 @@
 """Filters and models that write into the arrays they are given: a recording holds what each stage said all the same."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,29 @@ def test_what_was_worked_out_from_a_belief_is_worked_out_anew() -> None:
 
     steps = list(run(Scenario(Moving(), {0: equal(LINE, np.zeros((5, 1)))}, TICKS)))
     assert [step.stages[-1].belief.mean[0] for step in steps] == pytest.approx(np.arange(1, len(TICKS) + 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Told(Stage):
+    """A person's own record, which works something out as it is made."""
+
+    z: Array
+    norm: float = field(init=False)
+    twice: float = field(default=0.0, init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "norm", float(np.linalg.norm(self.z)))
+        object.__setattr__(self, "twice", 2 * self.norm)
+
+
+def test_what_a_record_works_out_as_it_is_made_stays() -> None:
+    class Telling:
+        def step(self, belief: Gaussian, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
+            yield Told("told", belief, tick.measurements["ruler"])
+
+    for step in run(Scenario(Telling(), {0: Gaussian(LINE, np.zeros(1), np.eye(1))}, TICKS)):
+        told: Any = step.stages[-1]
+        assert (told.norm, told.twice) == (abs(told.z[0]), 2 * abs(told.z[0]))
 
 
 def test_a_belief_of_labels_is_copied_too() -> None:

@@ -157,14 +157,16 @@ def run(scenario: Scenario, seed: int = 0, *, first: int = 0, belief: Belief | N
 
 
 def _own(value: Any) -> Any:
-    """A belief, a stage or what they hold, with arrays of its own; what was worked out from them is forgotten."""
+    """A belief, a stage or what they hold, with arrays of its own; what it keeps for itself (a belief's moments, once
+    they were asked for) is forgotten, for the arrays may have changed since."""
     if isinstance(value, np.ndarray):
         return value.copy()
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         return value
     owned = copy.copy(value)
     for one in dataclasses.fields(value):
-        object.__setattr__(owned, one.name, _own(getattr(value, one.name)) if one.init else one.default)
+        forgotten = not one.init and one.name.startswith("_") and one.default is not dataclasses.MISSING
+        object.__setattr__(owned, one.name, one.default if forgotten else _own(getattr(value, one.name)))
     return owned
 
 
