@@ -73,9 +73,9 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def to_matrix(q: Array) -> Array:
-    """Rotation matrices (*, 3, 3): world_R_body for world_q_body."""
+    """Rotation matrices (*, 3, 3): world_R_body for world_q_body; in single precision of such quaternions."""
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    r = np.empty((*q.shape[:-1], 3, 3))  # filled: stacking rows takes three times as long
+    r = np.empty((*q.shape[:-1], 3, 3), np.result_type(q, np.float32))  # stacking rows takes three times as long
     r[..., 0, 0], r[..., 0, 1], r[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     r[..., 1, 0], r[..., 1, 1], r[..., 1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
     r[..., 2, 0], r[..., 2, 1], r[..., 2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)

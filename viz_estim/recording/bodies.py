@@ -213,9 +213,5 @@ def xyzw(q: Array) -> Array:
 
 def tips(q: Array) -> Array:
     """The tips (*, 3, 3) of the body's x, y and z axes in the world, for quaternions (*, 4), as they are drawn."""
-    w, x, y, z = np.moveaxis(np.asarray(q, np.float32), -1, 0)
-    out = np.empty((*w.shape, 3, 3), np.float32)
-    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
-    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)
-    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
-    return out
+    # Its columns, as rows: the inverse turn's.
+    return quaternions.to_matrix(np.asarray(quaternions.conjugate(q), np.float32))
