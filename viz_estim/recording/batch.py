@@ -43,6 +43,11 @@ class StageRows:
         """The same, of a quantity that has one shape in all rows."""
         return np.asarray(self.values(path))
 
+    def some(self, path: str, rows: np.ndarray) -> Array:
+        """The same in some of the rows, in order: all of them are not copied."""
+        values = self.array(path)
+        return values if len(rows) == len(values) else values[rows]
+
     def prior(self, path: str) -> Array:
         """A quantity of the belief before the stage, such as `cov` (M, …); for rows that have one (`has_prior`)."""
         key = f"prior.{path}"

@@ -14,7 +14,7 @@ from viz_estim.core.scenery import Box, Landmarks, Path
 from viz_estim.core.spaces import SE2
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch
-from viz_estim.recording.columns import Column, Times, drawn, send, send_static
+from viz_estim.recording.columns import Column, Style, Times, drawn, send, send_static
 from viz_estim.recording.layout import Layout, flat3, place_of
 
 _DEFAULT_BODY = (0.6, 0.4, 0.15)
@@ -77,7 +77,7 @@ class Bodies:
         known = np.isfinite(place).all(1)
         path = f"{schema.WORLD}/{name}"
         if name == "estimate":
-            self._style(f"{path}/trail", rr.Points3D.from_fields(colors=[colour], radii=[_TRAIL]))
+            self._style(f"{path}/trail", Style(rr.Points3D, colors=[colour], radii=[_TRAIL]))
             self._send(f"{path}/trail", at, drawn(rr.Points3D, known.astype(int), len(at), positions=place[known]))
         assert layout.extent
         reach = 0.08 * layout.extent[1]
@@ -88,11 +88,11 @@ class Bodies:
             turn = of[layout.heading][:, -1]
             ahead = reach * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
             rows = known & np.isfinite(turn)
-            self._style(path, rr.Arrows3D.from_fields(colors=[colour], radii=[_ARROW]))
+            self._style(path, Style(rr.Arrows3D, colors=[colour], radii=[_ARROW]))
             columns = drawn(rr.Arrows3D, rows.astype(int), len(at), vectors=ahead[rows], origins=place[rows])
             self._send(path, at, columns)
         else:
-            self._style(path, rr.Points3D.from_fields(colors=[colour], radii=[2 * _ARROW]))
+            self._style(path, Style(rr.Points3D, colors=[colour], radii=[2 * _ARROW]))
             self._send(path, at, drawn(rr.Points3D, known.astype(int), len(at), positions=place[known]))
 
     def _draw_attitude(
@@ -104,8 +104,8 @@ class Bodies:
         pale = [tuple(np.add(c, schema.TRUTH) // 2) for c in schema.AXES]
         thin = 1.0 if estimated else 0.5
         name = path.rpartition("/")[2]
-        self._style(path, rr.Boxes3D.from_fields(colors=[colour], labels=[name], show_labels=False, radii=[_LINE]))
-        arrows = rr.Arrows3D.from_fields(colors=schema.AXES if estimated else pale, radii=[0.012 * reach * thin] * 3)
+        self._style(path, Style(rr.Boxes3D, colors=[colour], labels=[name], show_labels=False, radii=[_LINE]))
+        arrows = Style(rr.Arrows3D, colors=schema.AXES if estimated else pale, radii=[0.012 * reach * thin] * 3)
         self._style(f"{path}/axes", arrows)
         known = np.isfinite(q).all(1)
         box: dict[str, Array] = {}
@@ -147,7 +147,7 @@ class Bodies:
         self._places = at.stage
 
     def _draw_ellipses(self, path: str, at: Times, drawn_ones: _Ellipsoids, colour: schema.Colour) -> None:
-        self._style(path, rr.Ellipsoids3D.from_fields(colors=[colour], line_radii=[_LINE], fill_mode="MajorWireframe"))
+        self._style(path, Style(rr.Ellipsoids3D, colors=[colour], line_radii=[_LINE], fill_mode="MajorWireframe"))
         known = drawn_ones.known.astype(bool)
         shown = drawn_ones.pick(known)
         columns = drawn(
@@ -178,10 +178,10 @@ class Bodies:
                 way = rr.LineStrips3D(strips, colors=[line], radii=[_LINE / 2])
                 send_static(self._stream, f"{schema.WORLD}/truth/path", way)
 
-    def _style(self, path: str, archetype: Any) -> None:
+    def _style(self, path: str, style: Style) -> None:
         if path not in self._styled:
             self._styled.add(path)
-            send_static(self._stream, path, archetype)
+            send_static(self._stream, path, style.made())
 
     def _send(self, path: str, at: Times, columns: list[Column]) -> None:
         send(self._stream, path, at, columns)

@@ -18,7 +18,7 @@ from viz_estim.core.stages import Resample, Stage
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
 from viz_estim.recording.bodies import axes_of, tips, xyzw
-from viz_estim.recording.columns import drawn, send, send_static
+from viz_estim.recording.columns import Style, drawn, send, send_static
 from viz_estim.recording.layout import KEPT, Layout, place_of
 from viz_estim.recording.standing import Standing
 
@@ -84,8 +84,7 @@ class Clouds:
             own[:] = True  # those before stand, as drawn, in their parents' order
         columns = []
         if own.any():
-            states = rows.array("belief.states")
-            states = states if len(kept) == len(states) else states[kept]
+            states = rows.some("belief.states", kept)
             places = self._places(states)
             shown = {"origins": places, "vectors": self._ahead(states)} if self._turned else {"positions": places}
             columns += drawn(kind, N, len(at), **shown)
@@ -121,7 +120,7 @@ class Clouds:
             return
         counts = np.array([len(children) for _, children in lines])
         origins, ends = (self._places(np.concatenate(some)) for some in zip(*lines, strict=True))
-        style = rr.Arrows3D.from_fields(colors=[schema.BAND], radii=[-0.5])
+        style = Style(rr.Arrows3D, colors=[schema.BAND], radii=[-0.5])
         path, at = schema.drawn(rows.name, "ancestry"), rows.at.pick(np.array(drawn_rows))
         self._standing.draw(rows.name, "ancestors", path, at, style, counts, vectors=ends - origins, origins=origins)
 

@@ -14,7 +14,7 @@ import rerun as rr
 
 from viz_estim.core.quaternions import Array
 
-_FEW = 16 << 10  # bytes
+_FEW = 256 << 10  # bytes
 
 
 @dataclass(frozen=True)
@@ -60,17 +60,21 @@ def place(values: np.ndarray, timeline: str = "stage") -> Column:
     return Column(timeline, _owned(values.astype(np.int64, copy=False)))
 
 
-def _owned(values: np.ndarray) -> pa.Array:
-    """Numbers (N,) as an arrow array; few of them in arrow's own memory.
+def _owned(values: np.ndarray, kind: Any = None) -> pa.Array:
+    """Numbers (*,) as an arrow array (N,), of another kind if asked for; few of them in arrow's own memory.
 
     What lies in numpy's is given back by the thread that wrote it, which has to wait for the interpreter's lock and
-    takes it from the filter: that costs more than to copy some kilobytes.
+    takes it from the filter: that costs more than to copy what a processor has at hand.
     """
-    if values.nbytes > _FEW:
-        return pa.array(values)
-    memory = pa.allocate_buffer(values.nbytes)
-    np.frombuffer(memory, values.dtype)[:] = values
-    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, memory])
+    kind = np.dtype(kind or values.dtype)
+    if kind == values.dtype and values.nbytes > _FEW:
+        return pa.array(values.ravel())
+    memory = pa.allocate_buffer(values.size * kind.itemsize)
+    np.frombuffer(memory, kind).reshape(values.shape)[...] = values
+    return pa.Array.from_buffers(_arrow_type(kind), values.size, [None, memory])
+
+
+_arrow_type = cache(pa.from_numpy_dtype)
 
 
 @lru_cache(maxsize=256)
@@ -122,14 +126,14 @@ def numbers(archetype: str, component: str, rows: Array | list[Any], known: np.n
     if isinstance(rows, np.ndarray):
         size = rows.size // max(1, len(rows))
         if known is None or known.all():
-            flat, counts = np.asarray(rows, float).ravel(), size
+            flat, counts = rows, size
         else:
-            flat, counts = np.asarray(rows[known], float).ravel(), np.where(known, size, 0)
+            flat, counts = rows[known], np.where(known, size, 0)
     else:
         present = [np.asarray(row, float).ravel() for row in rows if row is not None]
         flat = np.concatenate(present) if present else np.empty(0)
         counts = np.array([0 if row is None else np.size(row) for row in rows])
-    return _column(_named(archetype, component), _owned(flat), counts, len(rows))
+    return _column(_named(archetype, component), _owned(flat, float), counts, len(rows))
 
 
 def indices(archetype: str, component: str, rows: list[Any]) -> Column:
@@ -170,10 +174,9 @@ def drawn(archetype: Any, counts: int | np.ndarray, rows: int, **components: np.
     for name, values in components.items():
         descriptor, kind = _kind(archetype, name)
         if pa.types.is_fixed_size_list(kind):
-            flat = _owned(np.asarray(values, np.float32).ravel())
-            batch = pa.FixedSizeListArray.from_arrays(flat, type=kind)
+            batch = pa.FixedSizeListArray.from_arrays(_owned(values, np.float32), type=kind)
         else:
-            batch = _owned(np.asarray(values, kind.to_pandas_dtype()).ravel())
+            batch = _owned(np.asarray(values), kind.to_pandas_dtype())
         columns.append(_column(descriptor, batch, counts, rows))
     return columns
 
@@ -187,6 +190,17 @@ def send_static(stream: rr.RecordingStream, path: str, archetype: Any) -> None:
     """What `stream.log(path, archetype, static=True)` does, at once: a log waits in the stream's own batches, and comes
     out among the columns in another order each time."""
     send_still(stream, path, still(archetype))
+
+
+class Style:
+    """What all rows of an entity look like. Made into an archetype when the first of them is drawn, no sooner: that
+    takes longer than to draw a hundred."""
+
+    def __init__(self, kind: Any, **fields: Any) -> None:
+        self.kind, self._fields = kind, fields
+
+    def made(self) -> Any:
+        return self.kind.from_fields(**self._fields)
 
 
 def still(archetype: Any) -> list[Column]:

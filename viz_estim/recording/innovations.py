@@ -57,7 +57,7 @@ class Innovations:
         at = rows.at if len(chosen) == len(rows.at) else rows.at.pick(chosen)
         space = getattr(rows.stages[0], field).space
         std = np.sqrt(np.maximum(np.diagonal(rows.prior("cov"), axis1=1, axis2=2), 0))
-        _, moved = split(rows.array("gain")[chosen], rows.array(f"{field}.residual")[chosen], std)
+        _, moved = split(rows.some("gain", chosen), rows.some(f"{field}.residual", chosen), std)
         names = [(name, axis) for name, part in space.parts.items() for axis in part.axes]
         shades = {name: schema.shades(self._colour(name), len(part.axes)) for name, part in space.parts.items()}
         colours = [shade for name in space.parts for shade in shades[name]]

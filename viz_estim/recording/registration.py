@@ -10,7 +10,7 @@ from viz_estim.core.scenery import Cloud
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
 from viz_estim.recording.bodies import xyzw
-from viz_estim.recording.columns import drawn, send, send_static
+from viz_estim.recording.columns import Style, drawn, send, send_static
 from viz_estim.recording.layout import Layout, flat3, place_of
 from viz_estim.recording.standing import Standing
 
@@ -66,7 +66,7 @@ class Registration:
         distance: Array = np.concatenate([one.distance[::step] for one, step in chosen])
         self._far = self._far or float(distance.max(initial=0.0)) or 1.0
         counts = np.array([len(one.distance[::step]) for one, step in chosen])
-        style = rr.Arrows3D.from_fields(radii=[-1.0])
+        style = Style(rr.Arrows3D, radii=[-1.0])
         self._standing.draw(
             rows.name, field, schema.drawn(rows.name, field), rows.at.pick(kept), style, counts,
             vectors=ends - origins, origins=origins, colors=schema.by_distance(distance / self._far),

@@ -14,7 +14,7 @@ from viz_estim.core.spaces import S2, SE2, SO3, Euclidean
 from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch, StageRows
 from viz_estim.recording.bodies import Bodies, sphere, tips
-from viz_estim.recording.columns import Times, send_static
+from viz_estim.recording.columns import Style, Times, send_static
 from viz_estim.recording.layout import Layout, as_product, flat3, is_position, leaves, place_of
 from viz_estim.recording.standing import Standing
 
@@ -64,7 +64,7 @@ class Scenes:
         self._drew[rows.name, field] = not shared[-1]
 
     def _draw_own_points(self, rows: StageRows, field: str, at: Times, kept: np.ndarray) -> None:
-        points = rows.array(f"{field}.points")[kept]
+        points = rows.some(f"{field}.points", kept)
         space = as_product(getattr(rows.stages[0], field).space)
         count = points.shape[1]
         faint = 0.55 if field == "drawn" else 1.0  # what a prediction starts from stands back
@@ -74,17 +74,17 @@ class Scenes:
             if isinstance(part, SO3) and name == self._layout.attitude:
                 shades = (faint * np.array(schema.AXES)).astype(int)
                 colours = [tuple(shades[i % 3]) for i in range(3 * count)]
-                style = rr.Points3D.from_fields(colors=colours, radii=[0.014 / faint**0.5])
+                style = Style(rr.Points3D, colors=colours, radii=[0.014 / faint**0.5])
                 path = f"{schema.ATTITUDE}/{rows.name}/{field}"
                 self._standing.draw(rows.name, field, path, at, style, 3 * count, positions=tips(x))
             elif name == self._layout.position:
                 colour = tuple((faint * np.array(schema.ESTIMATE)).astype(int))
-                style = rr.Points3D.from_fields(colors=[colour], radii=[-2.5])
+                style = Style(rr.Points3D, colors=[colour], radii=[-2.5])
                 path = schema.drawn(rows.name, field)
                 self._standing.draw(rows.name, field, path, at, style, count, positions=flat3(place_of(part, x)))
             elif not of_state and name in self._layout.sensors and own_scene(self._layout, name):
                 size = self._layout.reach[name]
-                style = rr.Points3D.from_fields(colors=[schema.ESTIMATE], radii=[0.014 * size])
+                style = Style(rr.Points3D, colors=[schema.ESTIMATE], radii=[0.014 * size])
                 path = f"{schema.sensor(name)}/{rows.name}/{field}"
                 self._standing.draw(rows.name, field, path, at, style, count, positions=x)
 
@@ -92,18 +92,18 @@ class Scenes:
         """A reading where it belongs: a place or a range in the world, three components as an arrow in a scene of the
         sensor's own, beside what was expected."""
         space = getattr(rows.stages[0], field).space
-        z = rows.array(f"{field}.z")[kept]
+        z = rows.some(f"{field}.z", kept)
         for name in space.parts:
             colour = schema.sensor_colour(self._layout.place(name))[1]
             mine = z[:, space.at[name]]
             if self._reads_place(name):
-                style = rr.Points3D.from_fields(colors=[colour], radii=[-4.0])
+                style = Style(rr.Points3D, colors=[colour], radii=[-4.0])
                 path = schema.drawn(rows.name, name)
                 self._standing.draw(
                     rows.name, field, path, at, style, 1, positions=flat3(mine[:, : 2 if self._layout.planar else 3])
                 )
             elif own_scene(self._layout, name):
-                expected = rows.array(f"{field}.predicted")[kept][:, space.at[name]]
+                expected = rows.some(f"{field}.predicted", kept)[:, space.at[name]]
                 self._draw_arrows(rows.name, field, name, at, mine, expected, colour)
             else:
                 self._draw_ranges(rows, field, name, at, kept, mine, colour)
@@ -116,7 +116,7 @@ class Scenes:
             self._spheres.add(path)
             send_static(self._stream, f"{path}/sphere", sphere(size))
         for what, values, shade in (("measured", z, colour), ("predicted", expected, schema.ESTIMATE)):
-            style = rr.Arrows3D.from_fields(colors=[shade], radii=[0.012 * size])
+            style = Style(rr.Arrows3D, colors=[shade], radii=[0.012 * size])
             self._standing.draw(stage, field, f"{path}/{stage}/{what}", at, style, 1, vectors=values)
 
     def _draw_ranges(
@@ -134,7 +134,7 @@ class Scenes:
         towards = estimate[:, None, :] - posts
         length = np.linalg.norm(towards, axis=-1, keepdims=True)
         vectors = z[:, :, None] * towards / np.maximum(length, 1e-9)
-        style = rr.Arrows3D.from_fields(colors=[colour], radii=[-1.5])
+        style = Style(rr.Arrows3D, colors=[colour], radii=[-1.5])
         origins = np.broadcast_to(posts, vectors.shape)
         path = schema.drawn(rows.name, name)
         self._standing.draw(rows.name, field, path, at, style, len(targets), vectors=vectors, origins=origins)
@@ -150,7 +150,7 @@ class Scenes:
         if "gain" not in layout.stages[rows.name]:
             return
         part, where = layout.space.parts[layout.position], layout.space.axes_at[layout.position]
-        K, residual = rows.array("gain")[kept], rows.array(f"{field}.residual")[kept]
+        K, residual = rows.some("gain", kept), rows.some(f"{field}.residual", kept)
         moves = flat3(np.swapaxes(K[:, where, :] * residual[:, None, :], 1, 2)[..., : len(place_of(part, np.empty(3)))])
         if isinstance(part, SE2):
             turn = mean[:, layout.space.at[layout.position]][:, 2, None]
@@ -160,7 +160,7 @@ class Scenes:
         origins = start + np.cumsum(moves, axis=1) - moves  # one after the other, from the old place to the new
         space = getattr(rows.stages[0], field).space
         colours = [schema.sensor_colour(layout.place(name))[1] for name, one in space.parts.items() for _ in one.axes]
-        style = rr.Arrows3D.from_fields(colors=colours, radii=[-2.0])
+        style = Style(rr.Arrows3D, colors=colours, radii=[-2.0])
         path = schema.drawn(rows.name, "moved")
         self._standing.draw(rows.name, field, path, at, style, len(colours), vectors=moves, origins=origins)
 

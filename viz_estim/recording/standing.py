@@ -11,7 +11,7 @@ import rerun as rr
 
 from viz_estim.core.quaternions import Array
 from viz_estim.recording.batch import Batch
-from viz_estim.recording.columns import Column, Times, drawn, place, send, send_static
+from viz_estim.recording.columns import Column, Style, Times, drawn, place, send, send_static
 
 _SHAPE: dict[Any, str] = {rr.Points3D: "positions", rr.Arrows3D: "vectors", rr.Ellipsoids3D: "half_sizes"}
 
@@ -38,14 +38,13 @@ class Standing:
         self._last: tuple[str, ...] = ()  # the stages whose geometry the last step drew
 
     def draw(
-        self, stage: str, field: str, path: str, at: Times, style: Any, count: int | np.ndarray, **values: Array
+        self, stage: str, field: str, path: str, at: Times, style: Style, count: int | np.ndarray, **values: Array
     ) -> None:
         """`count` points or arrows a row, in a style of their own."""
-        kind = type(style)
         if path not in self._paths:
-            send_static(self._stream, path, style)
-        self.add(stage, field, path, kind, _SHAPE[kind])
-        send(self._stream, path, at, drawn(kind, count, len(at), **values))
+            send_static(self._stream, path, style.made())
+        self.add(stage, field, path, style.kind, _SHAPE[style.kind])
+        send(self._stream, path, at, drawn(style.kind, count, len(at), **values))
 
     def add(self, stage: str, field: str, path: str, kind: Any, shape: str) -> None:
         """Takes in a path that another draws."""
