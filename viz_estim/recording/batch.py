@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from operator import attrgetter, is_
+from operator import attrgetter, is_, itemgetter
 from typing import Any
 
 import numpy as np
@@ -104,7 +104,7 @@ class Batch:
         self._stages = list(map(_STAGES, steps))
         self.kind, self.kinds, _ = _kinds([tuple(map(_NAME, stages)) for stages in self._stages])
         ticks = list(map(_TICK, steps))
-        self.tick_kind, _, examples = _kinds(list(map(_sensors, ticks)))
+        self.tick_kind, _, examples = _kinds(_sensors(ticks))
         self.ticks = [ticks[row] for row in examples]
         # A step without any stage (it failed at once) still takes a place on the stage timeline.
         counts = np.array([max(1, len(names)) for names in self.kinds])[self.kind]
@@ -128,18 +128,26 @@ class Batch:
         return self._ended[row]
 
     def _rows_of(self, name: str, groups: list[tuple[np.ndarray, int, bool]]) -> StageRows:
+        """The rows of a stage, which stands at one place in the steps of each group, and ends them or not."""
         rows = np.concatenate([members for members, _, _ in groups])
         offsets = np.concatenate([np.full(len(members), i) for members, i, _ in groups])
         last = np.concatenate([np.full(len(members), ends) for members, _, ends in groups])
+        stages: list[Stage] = []
+        before: list[Stage | None] = []
+        for members, i, _ in groups:
+            of, ended = self._stages, self._ended
+            if len(members) < len(of):
+                few = members.tolist()
+                of, ended = [of[row] for row in few], [ended[row] for row in few]
+            stages += map(itemgetter(i), of)
+            before += map(itemgetter(i - 1), of) if i else ended
         places = self.times.stage[rows] + offsets
         if len(groups) > 1:
             order = np.argsort(places)
             rows, offsets, last, places = rows[order], offsets[order], last[order], places[order]
-        of, ended = self._stages, self._ended
-        pairs = list(zip(rows.tolist(), offsets.tolist(), strict=True))
-        stages = [of[row][i] for row, i in pairs]
-        before = [of[row][i - 1] if i else ended[row] for row, i in pairs]
-        at = Times(self.times.step[rows], self.times.time[rows], places)
+            stages, before = [stages[i] for i in order.tolist()], [before[i] for i in order.tolist()]
+        everywhere = len(rows) == len(self.times) and not offsets.any()
+        at = self.times if everywhere else Times(self.times.step[rows], self.times.time[rows], places)
         return StageRows(name, stages, at, rows, offsets == 0, last, before)
 
     @cached_property
@@ -223,18 +231,20 @@ def _copied(stage: Any, before: Any, name: str) -> bool:
         return False
 
 
-_STAGES, _NAME, _INDEX, _TICK, _TIME = map(attrgetter, ("stages", "name", "index", "tick", "time"))
+_STAGES, _NAME, _INDEX, _TICK = map(attrgetter, ("stages", "name", "index", "tick"))
+_TIME, _MEASUREMENTS, _RAW, _FAULTS = map(attrgetter, ("time", "measurements", "raw", "faults"))
 
 
 def _kinds(keys: list[Any]) -> tuple[np.ndarray, list[Any], list[int]]:
     """The number of each key (N,) among the different ones, these, and the first row of each."""
-    kinds = list(dict.fromkeys(keys))
-    number = {kind: i for i, kind in enumerate(kinds)}
-    return np.array(list(map(number.__getitem__, keys))), kinds, list(map(keys.index, kinds))
+    first: dict[Any, int] = {}
+    rows, number = np.unique(list(map(first.setdefault, keys, range(len(keys)))), return_inverse=True)
+    return number, list(first), rows.tolist()
 
 
-def _sensors(tick: Tick) -> tuple[Any, ...]:
+def _sensors(ticks: list[Tick]) -> list[Any]:
     """What ticks have in common: which sensors they have readings of, and what is wrong with these."""
-    if tick.faults:
-        return (*tick.measurements, None, *tick.raw, None, *tick.faults.items(), *tick.stand_ins)
-    return (*tick.measurements, None, *tick.raw)
+    read: list[Any] = list(zip(map(tuple, map(_MEASUREMENTS, ticks)), map(tuple, map(_RAW, ticks)), strict=True))
+    for row in np.flatnonzero(list(map(bool, map(_FAULTS, ticks)))).tolist():
+        read[row] = (*read[row], *ticks[row].faults.items(), *ticks[row].stand_ins)
+    return read
