@@ -33,9 +33,9 @@ from viz_estim.recording.standing import Standing
 
 # A batch is cut by rows and bytes, which the same seed repeats; by time only where steps are so slow that a kill would
 # lose a second of them, or while a viewer watches.
-_ROWS = (550, 2500)  # at least, for each batch has its cost; and at most
-_BYTES = (2 << 20, 16 << 20)  # about, above the least rows; and in no case more
-_SECONDS = 0.7
+_ROWS = (700, 2500)  # at least, for each batch has its cost; and at most
+_BYTES = (2 << 20, 20 << 20)  # about, above the least rows; and in no case more
+_SECONDS = 0.8
 _SECONDS_WATCHED = 0.05
 
 
