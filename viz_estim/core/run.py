@@ -15,6 +15,7 @@ from viz_estim.core.beliefs import Belief
 from viz_estim.core.quaternions import Array
 from viz_estim.core.scenery import Scenery
 from viz_estim.core.stages import Stage, Start
+from viz_estim.core.yielded import Yielded
 
 
 class StandIn(NamedTuple):
@@ -125,8 +126,7 @@ def run(scenario: Scenario, seed: int = 0, *, first: int = 0, belief: Belief | N
     """
     chance = Chance(seed)
     pure = getattr(scenario.estimator, "pure", False)
-    # A person's own kind of belief may lack them: then its first stage says so.
-    shapes: Mapping[str, tuple[int, ...]] = getattr(scenario.beliefs[0], "shapes", {})
+    yielded = Yielded(scenario.beliefs[0], trusted=pure)
     for k in range(first, len(scenario.ticks)):
         tick = scenario.ticks[k]
         stages: list[Stage] = []
@@ -137,11 +137,11 @@ def run(scenario: Scenario, seed: int = 0, *, first: int = 0, belief: Belief | N
         assert belief is not None, "a scenario sets a belief at step 0"
         try:
             for made in scenario.estimator.step(belief if pure else _own(belief), tick, chance.at(k)):
-                _check_shapes(made, shapes)
+                yielded.check(made)
                 stage = made if pure else _own(made)
                 stages.append(stage)
                 before, belief = belief, stage.belief
-                for name in shapes:
+                for name in yielded.shapes:
                     if not _finite(getattr(belief, name), getattr(before, name)):
                         raise NotFinite("the belief is no longer finite")
         except Exception as failure:  # whatever a person's filter raises is what they came to see
@@ -178,17 +178,6 @@ def _finite(values: Array, before: Array) -> bool:
     # BLAS then wakes a thread on each core, which waits there in a busy loop.
     flat = values.ravel()
     return (flat.size <= 10_000 and isfinite(flat.dot(flat))) or bool(np.isfinite(flat).all())
-
-
-def _check_shapes(stage: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """TypeError or ValueError where a person's filter yields what is no stage, or a belief of another kind."""
-    if not isinstance(stage, Stage):
-        raise TypeError(f"step() must yield stages, got {type(stage).__name__}")
-    for name, shape in shapes.items():
-        value = getattr(stage.belief, name, None)
-        if not isinstance(value, np.ndarray) or value.shape != shape:
-            got = value.shape if isinstance(value, np.ndarray) else type(value).__name__
-            raise ValueError(f"stage {stage.name}: expected a {name} of shape {shape}, got {got}")
 
 
 def _failing_stage(stages: list[Stage], failure: Exception) -> str:

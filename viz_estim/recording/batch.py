@@ -41,7 +41,7 @@ class StageRows:
 
     def array(self, path: str) -> Array:
         """The same, of a quantity that has one shape in all rows."""
-        return np.asarray(self.values(path))
+        return np.asarray(self.values(path), float)
 
     def some(self, path: str, rows: np.ndarray) -> Array:
         """The same in some of the rows, in order: all of them are not copied."""

@@ -82,20 +82,23 @@ def _even(count: int, rows: int) -> pa.Array:
     return pa.array(np.arange(rows + 1, dtype=np.int32) * np.int32(count))
 
 
-def _column(name: Any, values: pa.Array, counts: int | np.ndarray, rows: int) -> Column:
-    """`counts` values a row."""
+def _column(
+    name: Any, values: pa.Array, counts: int | np.ndarray, rows: int, absent: np.ndarray | None = None
+) -> Column:
+    """`counts` values a row; absent: which rows say nothing, rather than that there is nothing."""
     if isinstance(counts, int):
         offsets = _even(counts, rows)
     else:
         offsets = _owned(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32))
-    return Column(name, pa.ListArray.from_arrays(offsets, values))
+    mask = pa.array(absent) if absent is not None else None
+    return Column(name, pa.ListArray.from_arrays(offsets, values, mask=mask))
 
 
 _KIND, _SIZE = attrgetter("dtype"), attrgetter("nbytes")
 
 
 def stacked(found: list[Any]) -> Array | list[Any]:
-    """Arrays or numbers as one float64 array (M, …), or the list itself where their shapes differ."""
+    """Arrays or numbers as one float64 array (M, …), or the list itself where shapes differ or one is None."""
     first = found[0] if found else None
     if isinstance(first, np.ndarray) and first.dtype == float and first.ndim:
         # The bytes one after the other: for small arrays several times as fast as what numpy does, which looks closer.
@@ -104,6 +107,8 @@ def stacked(found: list[Any]) -> Array | list[Any]:
                 return np.frombuffer(bytearray().join(found)).reshape(len(found), *first.shape)
         except (AttributeError, TypeError):  # not arrays all of them, or not in one piece
             pass
+    if any(one is None for one in found):
+        return found
     try:
         return np.array(found, dtype=float)
     except ValueError:
@@ -123,6 +128,7 @@ def numbers(archetype: str, component: str, rows: Array | list[Any], known: np.n
     if not isinstance(rows, np.ndarray) and type(None) not in set(map(type, rows)):
         rows = stacked(rows)
     counts: int | np.ndarray
+    absent = None
     if isinstance(rows, np.ndarray):
         size = rows.size // max(1, len(rows))
         if known is None or known.all():
@@ -133,7 +139,8 @@ def numbers(archetype: str, component: str, rows: Array | list[Any], known: np.n
         present = [np.asarray(row, float).ravel() for row in rows if row is not None]
         flat = np.concatenate(present) if present else np.empty(0)
         counts = np.array([0 if row is None else np.size(row) for row in rows])
-    return _column(_named(archetype, component), _owned(flat, float), counts, len(rows))
+        absent = np.array([row is None for row in rows])
+    return _column(_named(archetype, component), _owned(flat, float), counts, len(rows), absent)
 
 
 def indices(archetype: str, component: str, rows: list[Any]) -> Column:

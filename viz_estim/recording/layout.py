@@ -53,6 +53,7 @@ class Layout:
         first = scenario.beliefs[0]
         self.particles = len(first.log_weights) if isinstance(first, Particles) else 0
         self.stages: dict[str, dict[str, Any]] = {}
+        self._unknown: dict[str, list[str]] = {}  # by stage: the fields that were None so far
         self.inputs: list[str] = []
         self.sensors: dict[str, Space] = {}
         self.reach: dict[str, float] = {}
@@ -81,9 +82,8 @@ class Layout:
         """Takes in what is new; True where anything is."""
         new = False
         for rows in batch.stages:
-            if rows.name not in self.stages:
-                self._learn(rows)
-                new = True
+            if self._unknown.get(rows.name, True):
+                new |= self._learn(rows)
         for rows in batch.stages:  # all stages are known now: one may hold what another drew
             if self.particles and "belief.states" not in self.stages[rows.name]:
                 new |= self._learn_states(rows)
@@ -95,28 +95,37 @@ class Layout:
         self.inputs = list(seen)
         return new
 
-    def _learn(self, rows: StageRows) -> None:
-        fields: dict[str, Any] = {}
-        stage = rows.stages[0]
-        for field in dataclasses.fields(stage)[2:]:
-            value = getattr(stage, field.name)
-            if isinstance(value, SigmaPoints):
-                fields[field.name] = {"points": describe(value.space), "count": int(value.points.shape[-2])}
-            elif isinstance(value, Innovation):
-                fields[field.name] = {"innovation": describe(value.space)}
-                self.sensors |= value.space.parts
-                for name, at in value.space.at.items():
-                    size = float(np.linalg.norm(value.z[at]))
-                    self.reach[name] = size if size > 0.1 else 1.0
-            elif isinstance(value, Matches):
-                fields[field.name] = {"matches": value.source.shape[-1]}
-            elif isinstance(value, (np.ndarray, float, int)):
-                shape = list(np.shape(value))
-                cloud = bool(self.particles) and shape[:1] == [min(self.particles, KEPT)]
-                fields[field.name] = {"shape": shape} | ({"cloud": True} if cloud else {})
-            elif isinstance(value, tuple) and all(isinstance(one, str) for one in value):
-                fields[field.name] = {"names": list(value)}
-        self.stages[rows.name] = fields
+    def _learn(self, rows: StageRows) -> bool:
+        """Learns the fields of a stage, each from the first record that has it; True where there is anything new."""
+        new = rows.name not in self.stages
+        fields = self.stages.setdefault(rows.name, {})
+        names = [field.name for field in dataclasses.fields(rows.stages[0])[2:]]
+        unknown = self._unknown.setdefault(rows.name, names)
+        for name in list(unknown):
+            value = next((value for value in rows.objects(name) if value is not None), None)
+            if value is not None:
+                unknown.remove(name)
+                new = True
+                self._learn_field(fields, name, value)
+        return new
+
+    def _learn_field(self, fields: dict[str, Any], field: str, value: Any) -> None:
+        if isinstance(value, SigmaPoints):
+            fields[field] = {"points": describe(value.space), "count": int(value.points.shape[-2])}
+        elif isinstance(value, Innovation):
+            fields[field] = {"innovation": describe(value.space)}
+            self.sensors |= value.space.parts
+            for sensor, at in value.space.at.items():
+                size = float(np.linalg.norm(value.z[at]))
+                self.reach[sensor] = size if size > 0.1 else 1.0
+        elif isinstance(value, Matches):
+            fields[field] = {"matches": value.source.shape[-1]}
+        elif isinstance(value, (np.ndarray, np.number, float, int)):
+            shape = list(np.shape(value))
+            cloud = bool(self.particles) and shape[:1] == [min(self.particles, KEPT)]
+            fields[field] = {"shape": shape} | ({"cloud": True} if cloud else {})
+        elif isinstance(value, tuple) and all(isinstance(one, str) for one in value):
+            fields[field] = {"names": list(value)}
 
     def _learn_states(self, rows: StageRows) -> bool:
         """Finds the particles that are those of the stage before, or copies of them: they are kept once."""

@@ -42,7 +42,8 @@ class Gathered:
 
     def __init__(self, points: bool = True) -> None:
         self.times: list[dict[str, np.ndarray]] = []
-        self.columns: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {}  # chunk number, lengths, flat values
+        # By component: chunk number, lengths, flat values, and which rows said nothing.
+        self.columns: dict[str, list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]] = {}
         self._points = points
 
     def add(self, batch: pa.RecordBatch) -> None:
@@ -56,7 +57,8 @@ class Gathered:
             if component and (self._points or not is_geometry(component)):
                 column = batch.column(name)
                 lengths = column.value_lengths().fill_null(0).to_numpy()
-                entry = (len(self.times) - 1, lengths, column.flatten().to_numpy())
+                absent = column.is_null().to_numpy(zero_copy_only=False)
+                entry = (len(self.times) - 1, lengths, column.flatten().to_numpy(), absent)
                 self.columns.setdefault(component, []).append(entry)
 
     def names(self) -> list[str]:
@@ -66,7 +68,7 @@ class Gathered:
         """Values of another length in each row, as an array of arrays: (K, width), or (K,) for a width of 1."""
         rows: list[Array] = [np.empty((0, width))] * sum(len(times["step"]) for times in self.times)
         starts = np.concatenate([[0], np.cumsum([len(times["step"]) for times in self.times])])
-        for chunk, lengths, flat in self.columns.get(name, []):
+        for chunk, lengths, flat, _ in self.columns.get(name, []):
             for i, piece in enumerate(np.split(flat, np.cumsum(lengths)[:-1])):
                 rows[starts[chunk] + i] = piece.reshape(-1, width)
         found = np.empty(len(rows), object)
@@ -80,27 +82,28 @@ class Gathered:
     def column(self, name: str, shape: tuple[int, ...], *, fill: bool = False) -> Array:
         """The values (rows, *shape), NaN where a row has none; a −1 in the shape is found from the longest row.
 
-        fill: a row without one has that of the row before it.
+        fill: a row that is empty has that of the row before it; one that says nothing has none.
         """
         counts = [len(times["step"]) for times in self.times]
         starts = np.concatenate([[0], np.cumsum(counts)])
         pieces = self.columns.get(name, [])
         if -1 in shape:
-            longest = max((int(lengths.max(initial=0)) for _, lengths, _ in pieces), default=0)
+            longest = max((int(lengths.max(initial=0)) for _, lengths, _, _ in pieces), default=0)
             known = int(np.prod([v for v in shape if v != -1]))
             shape = tuple(longest // known if v == -1 else v for v in shape)
         size = int(np.prod(shape))
         out = np.full((int(starts[-1]), size), np.nan)
-        for chunk, lengths, flat in pieces:
+        for chunk, lengths, flat, absent in pieces:
             rows = np.flatnonzero(lengths == size)
             if name == "log_weights" and size > 1 and (one := lengths == 1).any():  # one for all particles
                 out[starts[chunk] + np.flatnonzero(one)] = flat[np.repeat(one, lengths)][:, None]
                 flat = flat[np.repeat(~one, lengths)]
             out[starts[chunk] + rows] = flat.reshape(-1, size) if size else 0
             if fill and len(rows) and size:  # what all rows share is kept in the first alone
-                source = rows[np.maximum(np.searchsorted(rows, np.arange(counts[chunk]), side="right") - 1, 0)]
-                out[starts[chunk] : starts[chunk] + counts[chunk]] = out[starts[chunk] + source]
-        return out.reshape(-1, *shape)
+                lacking = np.flatnonzero((lengths == 0) & ~absent)
+                source = rows[np.maximum(np.searchsorted(rows, lacking, side="right") - 1, 0)]
+                out[starts[chunk] + lacking] = out[starts[chunk] + source]
+        return out.reshape(len(out), *shape)
 
 
 def is_geometry(name: str) -> bool:
