@@ -18,6 +18,9 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, SO3, Product, Space, wrap
 
 _LEVEL = 0.95
+# The numbers of a stage that is one iteration towards one estimate, as a registration's fits are: the poses on the way
+# are nobody's estimate, and a run of them is judged where it ends.
+FIT = frozenset({"rmse", "converged"})
 
 
 def squared_distance(error: Array, cov: Array) -> Array:
@@ -216,6 +219,8 @@ class Tally:
         if step.index < self.first or not step.stages or step.error:
             return
         belief = step.stages[-1].belief
+        if all(hasattr(step.stages[-1], name) for name in FIT):
+            self.ends, self.truths = {}, []
         names = ("log_probabilities",) if self.space is None else ("mean", "cov")
         for name in names:
             self.ends.setdefault(name, []).append(getattr(belief, name))

@@ -14,7 +14,7 @@ import pyarrow as pa
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
-from viz_estim.core.consistency import summary
+from viz_estim.core.consistency import FIT, summary
 from viz_estim.core.descriptions import rebuild
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
@@ -104,6 +104,8 @@ class Run:
         if self.error is not None:
             counts[-1] = False
         last = self.step[counts][-1] if counts.any() else -1
+        if any(table.values.keys() >= FIT for table in self.stages.values()):
+            counts &= self.step == last
         innovations = []
         for table in self.stages.values():
             if "innovation.residual" in table.values:
