@@ -6,9 +6,11 @@ all stages of the run). A row that only clears what a past stage drew carries `s
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+import rerun as rr
 
 Colour = tuple[int, int, int]
 
@@ -94,23 +96,29 @@ _DISTANCES = _ramp((70, 140, 255), (255, 60, 60))
 
 
 def stage(name: str) -> str:
-    return f"/stages/{name}"
+    return f"/stages/{_part(name)}"
 
 
 def drawn(name: str, field: str) -> str:
-    return f"{WORLD}/{name}/{field}"
+    return f"{WORLD}/{_part(name)}/{field}"
 
 
 def sensor(name: str) -> str:
-    return f"/sensors/{name}"
+    return f"/sensors/{_part(name)}"
 
 
 def plot(group: str, component: str) -> str:
-    return f"{PLOTS}/{group}/{component}"
+    return f"{PLOTS}/{group}/{_part(component)}"
 
 
 def lane(name: str) -> str:
-    return f"{LANES}/{name}"
+    return f"{LANES}/{_part(name)}"
+
+
+@cache
+def _part(name: str) -> str:
+    """A person's name as it stands in an entity's path: blanks and the like are escaped, slashes part it."""
+    return "/".join(rr.escape_entity_path_part(part) for part in name.split("/") if part) or "_"
 
 
 class Entry(NamedTuple):
