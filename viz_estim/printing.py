@@ -102,12 +102,20 @@ def overview_text(value: dict[str, Any]) -> str:
         f"{value['recording']}: {value['scenario']}, {value['steps']} steps over {value['duration_s']:.2f} s{ended}",
         f"  stages: {', '.join(f'{name} {count}' for name, count in value['stages'].items())}",
         f"  state:  {', '.join(f'{k} [{u}]' if u else k for k, u in value['state'].items())}",
-        f"  data:   {', '.join(d['path'] for d in value['data']) or 'simulated'}, seed {value['seed']}",
-        f"  set:    {', '.join(f'{k}={short(v)}' for k, v in value['params'].items())}",
+        *_origin(value),
         *figures.lines(value | {"error": value["error"] if isinstance(value["error"], dict) else None}),
         f"viz-estim show {value['recording']} --step {value['last_step']}",
     ]
     return "\n".join(lines)
+
+
+def _origin(value: dict[str, Any]) -> list[str]:
+    """What the run was made of; nothing where a person's own code told of it."""
+    if value["seed"] is None:
+        return []
+    files = ", ".join(one["path"] for one in value["data"]) or "simulated"
+    settings = ", ".join(f"{k}={short(v)}" for k, v in value["params"].items())
+    return [f"  data:   {files}, seed {value['seed']}", *([f"  set:    {settings}"] if settings else [])]
 
 
 def step(run: Run, row: int) -> dict[str, Any]:

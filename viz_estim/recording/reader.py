@@ -142,7 +142,7 @@ def load(path: str | Path, *, points: bool | None = True) -> Run:
         elif entity.startswith("/stages/"):
             keep = "particles" in properties if points is None else points  # properties come first
             stages.setdefault(entity, Gathered(keep)).add(chunk.to_record_batch())
-    if properties.keys() & {"space", "labels"} and not steps.times:
+    if properties.keys() & {"space", "labels"} and not (steps.times and (stages or "result" in properties)):
         raise NotARun(f"{path}: the run was cut off before its first steps were written")
     if not properties.keys() & {"space", "labels"}:
         raise NotARun(f"{path}: holds no run of viz_estim (make one with `viz-estim run`)")
@@ -172,6 +172,8 @@ def load(path: str | Path, *, points: bool | None = True) -> Run:
 
 
 def _chunks(path: Path) -> Iterator[Any]:
+    if path.is_dir():
+        raise BadInput(f"{path}: is a folder, expected a recording")
     if not path.is_file():
         raise BadInput(f"{path}: no such recording")
     try:

@@ -27,6 +27,7 @@ SETTLING_FRAMES = 8  # before a picture that may be the last one; most layouts a
 # but not the warnings at its start, which are about the machine: no graphics card, a container.
 QUIET = "egui_wgpu=error,re_renderer::context=error,re_viewer::native=error"
 LOG = f"warn,re_grpc_server=info,re_sdk::web_viewer=info,{QUIET}"
+_RETAKEN = "Failed to render screenshot"  # on a machine that is too busy: another was taken
 Size = tuple[int, int]  # width, height in pixels
 
 
@@ -229,7 +230,8 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
         self._seen = max((entry.sequence for entry in self._ask(self._client.get_logs)), default=0)
 
     def _logged(self, *levels: str) -> list[str]:
-        entries = [entry for entry in self._ask(self._client.get_logs, self._seen) if entry.level in levels]
+        known = [entry for entry in self._ask(self._client.get_logs, self._seen) if entry.level in levels]
+        entries = [entry for entry in known if not entry.message.startswith(_RETAKEN)]
         return [" ".join(f"viewer: {entry.level.lower()}: {entry.message}".split()) for entry in entries]
 
     def _printed(self) -> str:
@@ -279,6 +281,8 @@ def open_files(paths: list[Path], *, web: bool = False) -> None:
 
 
 def _existing(path: str | Path) -> Path:
+    if Path(path).is_dir():
+        raise ViewerError(f"{path}: is a folder, expected a recording")
     if not Path(path).is_file():
         raise ViewerError(f"{path}: no such file; viz-estim run writes recordings")
     return Path(path).resolve()
