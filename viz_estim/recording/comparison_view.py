@@ -7,7 +7,7 @@ from itertools import groupby
 import numpy as np
 import rerun.blueprint as rrb
 
-from viz_estim.recording import links, schema
+from viz_estim.recording import links, plot_tabs, schema
 from viz_estim.recording.compared import Compared
 from viz_estim.recording.pictures import CANVAS, PANORAMA
 from viz_estim.recording.scene_views import Scenes, flat, view
@@ -31,10 +31,7 @@ def build(runs: list[Compared], scenes: Scenes, plots: list[Plot], notes: str) -
             white = ", truth white" if tab == "state" and any(np.isfinite(run.run.truth).any() for run in runs) else ""
             beneath += _tabs(_TABS[tab] + white, members, len(runs), named=bool(above))
     lanes = [
-        rrb.StateTimelineView(
-            origin=f"{run.path}{schema.LANES}", name=f"{run.title}: stage, and each sensor's readings"
-        )
-        for run in runs
+        plot_tabs.lanes(f"{run.path}{schema.LANES}", f"{run.title}: stage, and each sensor's readings") for run in runs
     ]
     beneath.append(rrb.Grid(*lanes, grid_columns=1 if len(runs) <= 3 else 3, name="Lanes"))
     beneath.append(links.panel(schema.NOTES, "What was compared", notes))

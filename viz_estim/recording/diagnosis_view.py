@@ -7,12 +7,12 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TextLogColumnKind
 
 from viz_estim.core.consistency import band
-from viz_estim.recording import links, schema
-from viz_estim.recording.blueprints import graph
+from viz_estim.recording import links, plot_tabs, schema
 from viz_estim.recording.compared import Alone, is_figure
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.lines import shown
 from viz_estim.recording.pictures import CANVAS
+from viz_estim.recording.plot_tabs import graph
 from viz_estim.recording.scene_views import Scenes, view
 from viz_estim.recording.sheet import titled
 
@@ -31,7 +31,7 @@ def build(alone: Alone, scenes: Scenes, findings: int, markdown: str) -> rrb.Blu
     if findings:
         columned = rrb.archetypes.TextLogColumns(text_log_columns=columns)
         texts.append(rrb.TextLogView(origin=LIST, name="Click a time to go there", columns=columned))
-    lanes = rrb.StateTimelineView(origin=schema.LANES, name="Lanes: findings, stages, readings")
+    lanes = plot_tabs.lanes(schema.LANES, "Lanes: findings, stages, readings")
     spatial = _spatial(alone, scenes)
     tabs = [tab for title, plots in _evidence(alone) for tab in _tabs(title, plots)]
     right: list[_Item] = [

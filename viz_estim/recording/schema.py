@@ -67,10 +67,10 @@ def line_colours(count: int) -> list[Colour]:
 
 
 def shades(colour: Colour, count: int) -> list[Colour]:
-    """The colour of a sensor, for each of its components: full, pale, dark, and again."""
+    """The colour of a sensor, for each of its components: full, dark, pale, and again."""
     r, g, b = colour
     pale = (r // 2 + 125, g // 2 + 125, b // 2 + 125)
-    return [((r, g, b), pale, (r // 2, g // 2, b // 2))[i % 3] for i in range(count)]
+    return [((r, g, b), (r // 2, g // 2, b // 2), pale)[i % 3] for i in range(count)]
 
 
 def by_weight(share: np.ndarray) -> np.ndarray:
