@@ -41,7 +41,7 @@ def build(alone: Alone, scenes: Scenes, findings: int, markdown: str) -> rrb.Blu
     ]
     sensors = {name.partition(".")[2] for name in alone.run.inputs if "." in name}
     count = findings + len(sensors) + 1 + bool(alone.run.labels)  # a lane is some 40 pixels high
-    low = min(0.42, 0.06 + 0.045 * count)
+    low = min(0.56, 0.06 + 0.045 * count)
     rest = (1 - low) / max(1, len(right) - 1)
     return rrb.Blueprint(
         rrb.Horizontal(
