@@ -1,5 +1,7 @@
 """What a newcomer stumbles over: files that are none, runs cut short at once, numbers that are none."""
 
+import runpy
+import sys
 from datetime import datetime
 from pathlib import Path
 
@@ -67,3 +69,11 @@ def test_what_is_no_number_is_named(tmp_path: Path) -> None:
     rec.stage("update", mean=[1], cov=[[1]])
     with pytest.raises(ValueError, match="step 0: expected a time in seconds, got datetime"):
         rec.step(time=datetime(2026, 1, 1))  # type: ignore[arg-type]
+
+
+def test_the_package_is_a_program(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["viz-estim", "show", "nowhere.rrd"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("viz_estim", run_name="__main__")
+    assert ended.value.code == 2
+    assert "nowhere.rrd: no such recording" in capsys.readouterr().err
