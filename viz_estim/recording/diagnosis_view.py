@@ -41,12 +41,13 @@ def build(alone: Alone, scenes: Scenes, findings: int, markdown: str) -> rrb.Blu
     ]
     sensors = {name.partition(".")[2] for name in alone.run.inputs if "." in name}
     count = findings + len(sensors) + 1 + bool(alone.run.labels)  # a lane is some 40 pixels high
-    low = min(0.56, 0.06 + 0.045 * count)
-    rest = (1 - low) / max(1, len(right) - 1)
+    low = min(0.5, 0.05 + 0.043 * count)
+    parts = [2.0] * bool(spatial) + [3.0] * bool(tabs)  # the evidence is more to read than the scene
+    rest = [(1 - low) * part / sum(parts) for part in parts]
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(*texts, row_shares=[3, 1][: len(texts)]),
-            rrb.Vertical(*right, row_shares=[rest] * (len(right) - 1) + [low]),
+            rrb.Vertical(*right, row_shares=[*rest, low]),
             column_shares=[2, 3],
         ),
         rrb.TimePanel(timeline="time", state="collapsed"),
