@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import rerun.blueprint as rrb
 
 from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product
@@ -15,8 +16,8 @@ def layout(space: Product, **known: Any) -> Any:
     """A layout of that state, with a truth and a gain, and nothing else unless it is said."""
     nothing = {"labels": (), "stages": {"update": {"gain": {"shape": [2, 1]}}}, "sensors": {}, "matched": False}
     place = list(known.get("sensors", {})).index
-    return SimpleNamespace(**nothing | {"particles": 0, "true_parts": list(space.parts), "place": place}
-                           | {"space": space} | known)  # fmt: skip
+    given = {"particles": 0, "duration": 9.0, "true_parts": list(space.parts), "place": place, "space": space}
+    return SimpleNamespace(**nothing | given | known)
 
 
 def names(tabs: list[Any]) -> list[str]:
@@ -62,6 +63,14 @@ def test_a_pose_says_that_its_sigma_has_two_units() -> None:
     assert (tab.name, plots(tab)[-1].name) == ("State: estimate amber", "pose σ [m, rad]")
 
 
+@pytest.mark.parametrize(("duration", "link"), [(59.0, 2), (61.0, 1)])
+def test_plots_zoom_together_but_of_a_long_run_they_show_all(duration: float, link: int) -> None:
+    (tab,) = plot_tabs.tabs(layout(Product(x=Euclidean(["x"])), stages={}, true_parts=[], duration=duration))
+    axes = [view.properties["TimeAxis"] for view in plots(tab)]
+    assert {axis.link.as_arrow_array()[0].as_py() for axis in axes} == {link}
+    assert {axis.view_range is None for axis in axes} == {link == 2}
+
+
 def test_single_numbers_stand_one_below_the_other_and_are_named_in_words() -> None:
     one = {"shape": []}
     stages = {"weigh": {"evidence": one, "ess": one}, "resample": {"distinct": one, "ess": one, "own": one}}
@@ -70,8 +79,8 @@ def test_single_numbers_stand_one_below_the_other_and_are_named_in_words() -> No
     assert figures.name == "Figures"
     assert [len(row.contents) for row in figures.contents] == [2, 2, 1]
     assert [view.name for view in plots(figures)] == [
-        "weigh: log-evidence of the reading", "weigh: effective sample size, of 1200 particles",
-        "resample: distinct ancestors, of 1200", "resample: effective sample size, of 1200 particles", "resample: own",
+        "weigh: log-evidence of the reading", "weigh: effective sample size, of 1200",
+        "resample: effective sample size, of 1200", "resample: distinct ancestors, of 1200", "resample: own",
     ]  # fmt: skip
     plain = layout(Product(x=Euclidean(["x"])), stages={"update": {"ess": one, "rmse": one}}, true_parts=[])
     assert [view.name for view in plots(plot_tabs.tabs(plain)[0])] == ["update: ess", "update: rmse"]

@@ -11,7 +11,6 @@ from viz_estim.recording.scenes import own_scene
 
 _Item = rrb.Container | rrb.View
 _BACKGROUND = [13, 14, 16]
-_MINUTE = 60.0  # s: of longer runs the viewer's plots show so much at first
 
 
 def build(layout: Layout) -> rrb.Blueprint:
@@ -54,10 +53,7 @@ def legend(layout: Layout) -> str:
             said += ", each sensor has its own; red, green and blue are the axes x, y, z"
         elif not layout.particles:
             said += ", each sensor has its own"
-    stage = "On the `stage` timeline each stage shows what it alone drew."
-    if layout.duration > _MINUTE:
-        stage += " Plots show a minute around the cursor, lanes the whole run."
-    return f"**Colours:** {said}. {stage}"
+    return f"**Colours:** {said}. On the `stage` timeline each stage shows what it alone drew."
 
 
 def _scenes(layout: Layout) -> list[_Item]:

@@ -35,6 +35,8 @@ def build(runs: list[Compared], scenes: Scenes, plots: list[Plot], notes: str) -
     ]
     beneath.append(rrb.Grid(*lanes, grid_columns=1 if len(runs) <= 3 else 3, name="Lanes"))
     beneath.append(links.panel(schema.NOTES, "What was compared", notes))
+    duration = max(float(run.run.time[-1] - run.run.time[0]) for run in runs)
+    beneath = [plot_tabs.show_all(tab, duration) for tab in beneath]
     tabs = rrb.Tabs(*beneath, name="over time", active_tab=0)
     rows: list[_Item] = [rrb.Tabs(*above, active_tab=0) if len(above) > 1 else above[0], tabs] if above else [tabs]
     shares = [1.0] if not above else [0.85, 1.0] if len(runs) <= 3 else [1.1, 1.0]

@@ -33,7 +33,8 @@ def build(alone: Alone, scenes: Scenes, findings: int, markdown: str) -> rrb.Blu
         texts.append(rrb.TextLogView(origin=LIST, name="Click a time to go there", columns=columned))
     lanes = plot_tabs.lanes(schema.LANES, "Lanes: findings, stages, readings")
     spatial = _spatial(alone, scenes)
-    tabs = [tab for title, plots in _evidence(alone) for tab in _tabs(title, plots)]
+    duration = float(alone.run.time[-1] - alone.run.time[0])
+    tabs = [plot_tabs.show_all(tab, duration) for title, plots in _evidence(alone) for tab in _tabs(title, plots)]
     right: list[_Item] = [
         *([rrb.Tabs(*spatial, active_tab=0)] if spatial else []),
         *([rrb.Tabs(*tabs, active_tab=0)] if tabs else []),
@@ -98,7 +99,7 @@ def _innovations(alone: Alone) -> list[_Plots]:
             top = rrb.ScalarAxis(range=(0.0, 4 * band(dof)[1]))
             views = [graph("nis", name, f"NIS {name}", top)]
             for axis, unit in zip(part.axes, part.axis_units, strict=True):
-                views.append(graph("innovation", f"{name}.{axis}", titled(name, axis, shown(unit)[0], "innov.")))
+                views.append(graph("innovation", f"{name}.{axis}", titled(name, axis, shown(unit)[0])))
             groups.append(views)
     return groups
 
@@ -118,17 +119,22 @@ def _errors(alone: Alone) -> list[_Plots]:
 def _belief(alone: Alone) -> list[_Plots]:
     if not alone.run.labels:
         return []
-    return [
-        [graph("probability", "labels", "Probability of each label", rrb.ScalarAxis(range=(0.0, 1.0)), legend=True)]
-    ]
+    return [[plot_tabs.probabilities()]]
 
 
 def _figures(alone: Alone) -> list[_Plots]:
     groups = [
         [
-            graph("figure", f"{table.name}.{name}", f"{table.name}: {name}")
-            for name, values in table.values.items()
-            if is_figure(name, values) and np.isfinite(values).any()
+            graph("figure", f"{table.name}.{name}", f"{table.name}: {words}")
+            for name, words in plot_tabs.figure_names(
+                [
+                    name
+                    for name, values in table.values.items()
+                    if is_figure(name, values) and np.isfinite(values).any()
+                ],
+                fit=_registered(alone),
+                particles=alone.run.properties.get("particles", {}).get("count"),
+            ).items()
         ]
         for table in alone.run.stages.values()
     ]

@@ -16,35 +16,67 @@ from viz_estim.recording.layout import Layout
 _Item = rrb.Container | rrb.View
 _MANY = 5  # rows of plots that one tab holds
 _READABLE = 4  # rows of a tab at most where they can as well be in two
-# What the single numbers of our own stages mean.
+_MINUTE = 60.0  # s
+# What the single numbers of our own stages mean, those first that say most.
 _OF_CLOUDS = {
-    "ess": "effective sample size, of {} particles",
-    "distinct": "distinct ancestors, of {}",
     "evidence": "log-evidence of the reading",
+    "ess": "effective sample size",
+    "distinct": "distinct ancestors",
 }
 _OF_FITS = {"rmse": "RMSE of the matches [m]", "count": "matches", "converged": "1 when the matches repeat"}
+_COUNTED = ("ess", "distinct")  # of all particles
+
+
+def figure_names(fields: list[str], *, fit: bool, particles: int | None) -> dict[str, str]:
+    """By field, what a stage's single numbers mean; a person's own are called as they call them. fit: the run is a
+    registration; particles: how many there are, None where there are none, 0 where that differs."""
+    known = _OF_FITS if fit else {} if particles is None else _OF_CLOUDS
+    fields = sorted(fields, key=lambda field: list(known).index(field) if field in known else len(known))
+    return {f: known.get(f, f) + (f", of {particles}" if particles and f in _COUNTED else "") for f in fields}
 
 
 def lanes(origin: str, name: str) -> rrb.StateTimelineView:
-    """Lanes, of the whole run: of a long one the plots show a minute around the cursor."""
+    """Lanes, of the whole run."""
+    return rrb.StateTimelineView(origin=origin, name=name, time_view=_whole_run())
+
+
+def show_all(item: _Item, duration: float) -> _Item:
+    """The same, where plots show the whole of a long run. Plots that are linked, so that they zoom together, show a
+    minute around the cursor, half of which is empty at first."""
+    if duration > _MINUTE:
+        for view in _views(item):
+            if isinstance(view, rrb.TimeSeriesView):
+                view.properties["TimeAxis"] = _whole_run()
+    return item
+
+
+def _views(item: _Item) -> list[rrb.View]:
+    return [view for inner in item.contents for view in _views(inner)] if isinstance(item, rrb.Container) else [item]
+
+
+def _whole_run() -> rrb.TimeAxis:
     whole = TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
-    axis = rrb.TimeAxis(link="Independent", view_range=whole)
-    return rrb.StateTimelineView(origin=origin, name=name, time_view=axis)
+    return rrb.TimeAxis(link="Independent", view_range=whole)
 
 
 def tabs(layout: Layout) -> list[_Item]:
     """All tabs, the one that says most first."""
+    return [show_all(tab, layout.duration) for tab in _tabs(layout)]
+
+
+def _tabs(layout: Layout) -> list[_Item]:
     if layout.labels:
-        return [_probabilities()]
+        return [rrb.Vertical(probabilities(), name="Belief")]
     health, figures = _health(layout), _figures(layout)
     # A registration's fit says more than its errors; without a truth there is no error at all.
     first = [*figures, *health] if layout.matched or not layout.true_parts else [*health[:1], *figures, *health[1:]]
     return [*first, *_state(layout), *_moved(layout)]
 
 
-def _probabilities() -> rrb.Container:
+def probabilities() -> rrb.TimeSeriesView:
+    """Of each label; the bars beside it are its legend."""
     name = "Probability of each label, in the colour of its bar"
-    return rrb.Vertical(graph("probability", "labels", name, rrb.ScalarAxis(range=(-0.02, 1.02))), name="Belief")
+    return graph("probability", "labels", name, rrb.ScalarAxis(range=(-0.02, 1.02)))
 
 
 def _health(layout: Layout) -> list[_Item]:
@@ -81,21 +113,14 @@ def _health(layout: Layout) -> list[_Item]:
 
 def _figures(layout: Layout) -> list[_Item]:
     """The single numbers of stages, over time: one below the other, so that their times are."""
-    views = [
-        graph("figure", f"{stage}.{field}", f"{stage}: {_figure(layout, field)}")
-        for stage, fields in layout.stages.items()
-        for field, what in fields.items()
-        if what.get("shape") == []
-    ]
+    views = []
+    for stage, fields in layout.stages.items():
+        numbers = [field for field, what in fields.items() if what.get("shape") == []]
+        named = figure_names(numbers, fit=layout.matched, particles=layout.particles or None)
+        views += [graph("figure", f"{stage}.{field}", f"{stage}: {name}") for field, name in named.items()]
     across = -(-len(views) // _READABLE)
     rows = [rrb.Horizontal(*views[i : i + across]) for i in range(0, len(views), max(across, 1))]
     return [rrb.Vertical(*rows, name="Figures")] if rows else []
-
-
-def _figure(layout: Layout, field: str) -> str:
-    """What a number of ours means; a person's own is called as they call it."""
-    known = _OF_FITS if layout.matched else _OF_CLOUDS if layout.particles else {}
-    return known.get(field, field).format(layout.particles)
 
 
 def _state(layout: Layout) -> list[_Item]:
