@@ -63,6 +63,15 @@ def test_a_pose_says_that_its_sigma_has_two_units() -> None:
     assert (tab.name, plots(tab)[-1].name) == ("State: estimate amber", "pose σ [m, rad]")
 
 
+@pytest.mark.parametrize(
+    ("name", "axis", "title"),
+    [("accel", "x", "accel x"), ("heading", "angle", "heading"), ("range/1", "range", "range/1"), ("y", "y", "y"),
+     ("state", "vx", "vx"), ("range", "range0", "range0"), ("range", "rangefinder", "range rangefinder")],
+)  # fmt: skip
+def test_a_title_says_nothing_twice(name: str, axis: str, title: str) -> None:
+    assert plot_tabs.titled(name, axis) == title
+
+
 @pytest.mark.parametrize(("duration", "link"), [(59.0, 2), (61.0, 1)])
 def test_plots_zoom_together_but_of_a_long_run_they_show_all(duration: float, link: int) -> None:
     (tab,) = plot_tabs.tabs(layout(Product(x=Euclidean(["x"])), stages={}, true_parts=[], duration=duration))

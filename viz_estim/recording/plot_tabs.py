@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import rerun.blueprint as rrb
@@ -215,8 +216,11 @@ def graph(
 
 
 def titled(name: str, axis: str) -> str:
-    """`accel x`, but `range/1` or `heading` alone where the axis adds nothing."""
-    return name if axis in (name.partition("/")[0], "angle") else f"{name} {axis}"
+    """`accel x`, but `range/1` or `heading` alone where the axis adds nothing, and `range0` where the name does,
+    or where it is `state`, as what has no parts is called."""
+    if axis in (name.partition("/")[0], "angle"):
+        return name
+    return axis if name == "state" or re.fullmatch(rf"{re.escape(name)}\d+", axis) else f"{name} {axis}"
 
 
 def unit_of(space: Space, i: int = 0, units: tuple[str, ...] | None = None) -> str:
