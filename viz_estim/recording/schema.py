@@ -96,27 +96,27 @@ _DISTANCES = _ramp((70, 140, 255), (255, 60, 60))
 
 
 def stage(name: str) -> str:
-    return f"/stages/{_part(name)}"
+    return f"/stages/{as_part(name)}"
 
 
 def drawn(name: str, field: str) -> str:
-    return f"{WORLD}/{_part(name)}/{field}"
+    return f"{WORLD}/{as_part(name)}/{field}"
 
 
 def sensor(name: str) -> str:
-    return f"/sensors/{_part(name)}"
+    return f"/sensors/{as_part(name)}"
 
 
 def plot(group: str, component: str) -> str:
-    return f"{PLOTS}/{group}/{_part(component)}"
+    return f"{PLOTS}/{group}/{as_part(component)}"
 
 
 def lane(name: str) -> str:
-    return f"{LANES}/{_part(name)}"
+    return f"{LANES}/{as_part(name)}"
 
 
 @cache
-def _part(name: str) -> str:
+def as_part(name: str) -> str:
     """A person's name as it stands in an entity's path: blanks and the like are escaped, slashes part it."""
     return "/".join(rr.escape_entity_path_part(part) for part in name.split("/") if part) or "_"
 
