@@ -63,6 +63,14 @@ def test_metrics_name_each_error_with_its_unit_and_measure_it() -> None:
     ]  # fmt: skip
 
 
+def test_what_has_several_units_has_an_error_for_each() -> None:
+    space = Euclidean(("x", "y", "vx", "vy", "scale"), ("m", "m", "m/s", "m/s", ""))
+    truth = np.zeros((1, 5))
+    assert metrics(space, np.array([[3.0, 4, 5, 12, 2]]), truth) == {
+        "state_rmse_m": 5.0, "state_rmse_mps": 13.0, "state_rmse": 2.0
+    }  # fmt: skip
+
+
 def test_steps_without_truth_are_left_out_part_by_part() -> None:
     rng, T = np.random.default_rng(4), 30
     space = Product(attitude=SO3(), rate=Euclidean(("x", "y", "z"), "rad/s"))

@@ -1,8 +1,10 @@
 """A recorded run again with other parameters: its first steps to the bit, and what it refuses and why."""
 
+import io
 import json
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ import viz_estim
 from viz_estim.core.run import run
 from viz_estim.debugger import forking
 from viz_estim.debugger.live import Live
+from viz_estim.debugger.session import debug
 from viz_estim.recording.reader import Run
 from viz_estim.recording.recorder import Recorder
 from viz_estim.running import plan, recorded
@@ -97,6 +100,26 @@ def test_what_may_not_be_set_is_one_line(setting: str, cli: Cli, recording: Path
     assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
     assert REFUSED[setting] in done.err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_fork_is_not_written_over_what_it_forks(cli: Cli, recording: Path) -> None:
+    before = recording.read_bytes()
+    done = cli("fork", recording, "--at", 5, "--set", "gyro_noise=0.1", "--out", recording)
+    assert (done.code, done.out, done.err.count("\n")) == (2, "", 1)
+    assert "is the recording itself" in done.err
+    assert recording.read_bytes() == before
+
+
+def test_a_branch_is_not_saved_over_the_recording_that_is_looked_into(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before, told = recording.read_bytes(), io.StringIO()
+    typed = io.StringIO(f"step 2\nset gyro_noise=0.1\nsave {recording}\nquit\n")
+    plain: dict[str, Any] = {"data": None, "calibration": None, "settings": [], "seed": None, "viewer": False}
+    debug(str(recording), **plain, stdin=typed, stdout=told)
+    assert "is the recording that is looked into; choose another name" in told.getvalue()
+    assert recording.read_bytes() == before
 
 
 @pytest.mark.parametrize("step", [-1, 10_000])

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Cli
+from conftest import Cli, strict
 
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
@@ -368,6 +368,22 @@ def test_bad_parameters_are_refused(settings: list[str], words: str, cli: Cli, t
     code, out, err = cli("run", "scan-icp", "--seed", "1", *options, "--out", tmp_path / "out.rrd")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert words in err
+
+
+def test_a_registration_is_judged_where_it_ends(cli: Cli, tmp_path: Path) -> None:
+    data = scan([OWN], RNG)
+    end = steps_of(data)[0][-1].stages[-1].belief
+    error = SPACES[3].minus(end.mean, data.truth)
+    nees = float(error @ np.linalg.solve(end.cov, error))
+    out = tmp_path / "out.rrd"
+    told = strict(cli("run", "scan-icp", "--data", OWN, "--out", out, "--json"))
+    assert told["nees"] == {"mean": pytest.approx(nees), "dof": 6, "inside": 0.0}
+    assert told["metrics"]["position_rmse_m"] == told["metrics"]["final_position_error_m"]
+    shown = strict(cli("show", out, "--json"))
+    assert (shown["nees"], shown["metrics"]) == (told["nees"], told["metrics"])
+    assert "(expected 6; at the end; 95 % interval 1.24 to 14.4: above: its covariance is too small)" in cli(
+        "show", out
+    ).out  # fmt: skip
 
 
 def test_the_own_files_are_what_simulate_writes_and_run(cli: Cli, tmp_path: Path) -> None:

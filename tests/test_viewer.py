@@ -26,6 +26,13 @@ pytestmark = pytest.mark.draws
 SIZE = (900, 613)
 STEPS = 200
 Picture = Callable[[str, float], bytes]
+BAD_FILES = {
+    "missing": "no such file",
+    "cut": "was cut off before any data",
+    "header": "has no data",
+    "empty": "has no data",
+    "noise": "(Not an RRD file",
+}
 
 
 def write_recording(path: Path) -> Path:
@@ -170,10 +177,12 @@ def test_a_live_run_is_followed(recording: Path) -> None:
 def test_files_that_are_no_recordings(
     viewer: Viewer, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(viewer_module, "LOAD_S", 3.0)  # a file without data is waited for as long as that
+    monkeypatch.setattr(viewer_module, "LOAD_S", 1e9)  # that a file has no data is not found by waiting
     (tmp_path / "cut.rrd").write_bytes(recording.read_bytes()[:3000])
+    (tmp_path / "header.rrd").write_bytes(recording.read_bytes()[:12])
+    (tmp_path / "empty.rrd").write_bytes(b"")
     (tmp_path / "noise.rrd").write_bytes(np.random.default_rng(0).bytes(4000))
-    for name, words in {"missing": "no such file", "cut": "has no data", "noise": "(Not an RRD file"}.items():
+    for name, words in BAD_FILES.items():
         with pytest.raises(ViewerError) as error:
             viewer.open(tmp_path / f"{name}.rrd")
         assert_one_line(error, f"{name}.rrd", words)

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from viz_estim import figures
 from viz_estim.core.measurement import split
+from viz_estim.figures import short
 from viz_estim.parameters import kind_text, parameters
 
 if TYPE_CHECKING:
@@ -54,7 +56,7 @@ def scenarios_text(value: dict[str, Any]) -> str:
     lines = []
     for one in value["scenarios"]:
         lines += [f"{one['name']}: {one['description']}"]
-        lines += [f"    {k}={_short(p['default'])}  ({p['type']})" for k, p in one["parameters"].items()]
+        lines += [f"    {k}={short(p['default'])}  ({p['type']})" for k, p in one["parameters"].items()]
     return "\n".join([*lines, "", "viz-estim run NAME --data PATH --set K=V runs one."])
 
 
@@ -64,32 +66,10 @@ def result_text(result: dict[str, Any]) -> str:
     lines = [
         f"{result['scenario']}: {result['steps']} steps, {result['stages']} stages, {result['duration_s']:.2f} s of "
         f"data; {wall['estimate']:.2f} s to estimate, {wall['record']:.2f} s to record",
-        *_figures(result),
+        *figures.lines(result),
     ]
     command = "debug" if result.get("error") else "open"
     return "\n".join([*lines, f"viz-estim {command} {result['recording']}"])
-
-
-def _figures(result: dict[str, Any]) -> list[str]:
-    lines = []
-    if result.get("error"):
-        error = result["error"]
-        lines.append(f"FAILED at step {error['step']}, stage {error['stage']}: {error['message']}")
-    lines += [f"  {name:24} {_short(value)}" for name, value in result["metrics"].items()]
-    for sensor, nis in result["nis"].items():
-        inside = nis["low"] <= nis["mean"] <= nis["high"]
-        verdict = "inside" if inside else "above: the filter trusts it too much" if nis["mean"] > nis["high"] else (
-            "below: the filter trusts it too little")  # fmt: skip
-        lines.append(
-            f"  NIS {sensor:20} {nis['mean']:.3g} (expected {nis['dof']}; 95 % band {nis['low']:.3g} to "
-            f"{nis['high']:.3g}: {verdict})"
-        )
-    if nees := result["nees"]:
-        lines.append(
-            f"  NEES                     {nees['mean']:.3g} (expected {nees['dof']}; {nees['inside']:.0%} of the steps "
-            "inside their 95 % interval)"
-        )
-    return lines
 
 
 def overview(run: Run) -> dict[str, Any]:
@@ -122,12 +102,20 @@ def overview_text(value: dict[str, Any]) -> str:
         f"{value['recording']}: {value['scenario']}, {value['steps']} steps over {value['duration_s']:.2f} s{ended}",
         f"  stages: {', '.join(f'{name} {count}' for name, count in value['stages'].items())}",
         f"  state:  {', '.join(f'{k} [{u}]' if u else k for k, u in value['state'].items())}",
-        f"  data:   {', '.join(d['path'] for d in value['data']) or 'simulated'}, seed {value['seed']}",
-        f"  set:    {', '.join(f'{k}={_short(v)}' for k, v in value['params'].items())}",
-        *_figures(value | {"error": value["error"] if isinstance(value["error"], dict) else None}),
+        *_origin(value),
+        *figures.lines(value | {"error": value["error"] if isinstance(value["error"], dict) else None}),
         f"viz-estim show {value['recording']} --step {value['last_step']}",
     ]
     return "\n".join(lines)
+
+
+def _origin(value: dict[str, Any]) -> list[str]:
+    """What the run was made of; nothing where a person's own code told of it."""
+    if value["seed"] is None:
+        return []
+    files = ", ".join(one["path"] for one in value["data"]) or "simulated"
+    settings = ", ".join(f"{k}={short(v)}" for k, v in value["params"].items())
+    return [f"  data:   {files}, seed {value['seed']}", *([f"  set:    {settings}"] if settings else [])]
 
 
 def step(run: Run, row: int) -> dict[str, Any]:
@@ -287,14 +275,8 @@ def _noises(value: dict[str, Any]) -> list[str]:
 
 
 def _named(names: tuple[str, ...], values: Any, units: tuple[str, ...]) -> str:
-    return "  ".join(f"{n}={_short(v)}{f' {u}' if u else ''}" for n, v, u in zip(names, values, units, strict=True))
+    return "  ".join(f"{n}={short(v)}{f' {u}' if u else ''}" for n, v, u in zip(names, values, units, strict=True))
 
 
 def _row(values: Any) -> str:
-    return "  ".join(_short(v) for v in np.atleast_1d(values))
-
-
-def _short(value: Any) -> str:
-    if value is None or isinstance(value, bool):  # as `--set` takes them
-        return "none" if value is None else "yes" if value else "no"
-    return f"{value:.5g}" if isinstance(value, (float, np.floating)) else str(value)
+    return "  ".join(short(v) for v in np.atleast_1d(values))

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from viz_estim.checking import check_scenario
 from viz_estim.core.consistency import Tally
 from viz_estim.core.run import Scenario, Step, run
 from viz_estim.errors import BadInput
@@ -60,10 +61,7 @@ class Plan:
                 raise
             where = f"{type(error).__name__}: {error}"
             raise BadInput(f"{self.source.name}: raised {where}; mend the function, or give what it needs") from error
-        if not isinstance(scenario, Scenario):
-            raise BadInput(f"{self.source.name}: returned {type(scenario).__name__}, expected a viz_estim Scenario")
-        if not len(scenario.ticks) or 0 not in scenario.beliefs:
-            raise BadInput(f"{self.source.name}: a scenario needs at least one tick, and a belief at step 0")
+        check_scenario(scenario, self.source.name)
         return scenario
 
     def _built(self, rng: np.random.Generator) -> Scenario:

@@ -32,7 +32,7 @@ def space_of(names: Names) -> Space:
 
 def gaussian(where: str, space: Space | None, mean: ArrayLike, cov: ArrayLike) -> Gaussian:
     """N(mean (n,), cov (d, d)); without a space its components are x0, x1, …."""
-    x, P = vector(mean), matrix(cov)
+    x, P = _number(f"{where}: mean", mean).reshape(-1), np.atleast_2d(_number(f"{where}: cov", cov))
     space = space or Euclidean([f"x{i}" for i in range(len(x))])
     n, d = len(space.names), len(space.axes)
     fits(f"{where}: mean", x, (n,))
@@ -141,7 +141,7 @@ def others(
             space = reading if name == "mapped" and reading else getattr(belief, "space", None)
             found[name] = _points(f"{where}: {name}", space, values)
         else:
-            found[name] = np.array(values, float)
+            found[name] = _number(f"{where}: {name}", values)
     if isinstance(belief, Particles):
         for name in found.keys() & {"log_likelihoods", "ancestors"}:
             fits(f"{where}: {name}", found[name], belief.log_weights.shape)
@@ -172,6 +172,13 @@ def _evidence(logs: Array) -> Array:
     """log Σ w·p(z | x), of log w + log p(z | x) (N,)."""
     best = logs.max()
     return np.asarray(best + np.log(np.exp(logs - best).sum()) if np.isfinite(best) else np.nan)
+
+
+def _number(what: str, values: ArrayLike) -> Array:
+    try:
+        return np.array(values, float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{what}: expected numbers, got {values!r:.60}") from error
 
 
 def vector(values: ArrayLike) -> Array:

@@ -18,6 +18,9 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, SO3, Product, Space, wrap
 
 _LEVEL = 0.95
+# The numbers of a stage that is one iteration towards one estimate, as a registration's fits are: the poses on the way
+# are nobody's estimate, and a run of them is judged where it ends.
+FIT = frozenset({"rmse", "converged"})
 
 
 def squared_distance(error: Array, cov: Array) -> Array:
@@ -74,10 +77,13 @@ def _errors(name: str, part: Space, x: Array, y: Array) -> dict[str, float]:
         place = x[:, :2] - y[:, :2]
         final = {"final_position_error_m": rms(place[-1:])}
         return {"position_rmse_m": rms(place), **final, "heading_rmse_rad": rms(turn)}
-    unit = _UNIT_NAMES.get(part.axis_units[0], part.axis_units[0])
-    error = part.minus(x, y)
-    found = {f"{name}_rmse_{unit}" if unit else f"{name}_rmse": rms(error)}
-    return found | ({"final_position_error_m": rms(error[-1:])} if name == "position" and unit == "m" else {})
+    error, found = part.minus(x, y), {}
+    for unit in dict.fromkeys(part.axis_units):  # what is in metres and what in m/s make no sum
+        along = error[:, [one == unit for one in part.axis_units]]
+        word = _UNIT_NAMES.get(unit, unit)
+        found[f"{name}_rmse_{word}" if word else f"{name}_rmse"] = rms(along)
+    at_end = {"final_position_error_m": rms(error[-1:])}
+    return found | (at_end if name == "position" and set(part.axis_units) == {"m"} else {})
 
 
 def _attitude(x: Array, y: Array) -> dict[str, float]:
@@ -216,6 +222,8 @@ class Tally:
         if step.index < self.first or not step.stages or step.error:
             return
         belief = step.stages[-1].belief
+        if all(hasattr(step.stages[-1], name) for name in FIT):
+            self.ends, self.truths = {}, []
         names = ("log_probabilities",) if self.space is None else ("mean", "cov")
         for name in names:
             self.ends.setdefault(name, []).append(getattr(belief, name))

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from viz_estim.core import quaternions
+from viz_estim.core.names import check_name
 from viz_estim.core.quaternions import Array
 
 
@@ -256,9 +257,8 @@ class Product:
     """
 
     def __init__(self, **parts: Space) -> None:
-        self.parts = parts
-        self.at: dict[str, slice] = {}
-        self.axes_at: dict[str, slice] = {}
+        self.parts = {check_name(name, "part"): part for name, part in parts.items()}
+        self.at, self.axes_at = dict[str, slice](), dict[str, slice]()
         n = d = 0
         for name, part in parts.items():
             self.at[name] = slice(n, n := n + len(part.names))

@@ -189,6 +189,8 @@ def fork(path: Path, step: int, settings: list[str], out: Path | None, progress:
     last = parts[-1]
     out = out or path.with_name(f"{path.stem.removesuffix('.partial')}-fork{step}.rrd")
     check_writable(out, suffix=".rrd")
+    if out.exists() and out.samefile(path):
+        raise BadInput(f"{out}: is the recording itself; choose another name for the fork")
     again = live(parts)
     earlier = (again.step(k) for k in range(step))
     later = run(last.scenario, last.plan.seed, first=step, belief=original.before(step))

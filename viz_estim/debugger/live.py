@@ -64,6 +64,7 @@ class Live:
         self._beliefs = Beliefs()
         self._starts = [0]  # by step, its first place; one more than there are steps so far
         self._done: dict[int, Step] = {}  # the latest few, as they came
+        self._shown: tuple[int, Step, Frame] | None = None  # the frame that was asked for last: it is asked for again
         self._ahead: Iterator[Step] | None = None
         self._over = False
 
@@ -130,9 +131,11 @@ class Live:
             raise NoSuchPlace(f"no stage {place}: the run has stages 0 to {self._starts[-1] - 1}")
         k = bisect_right(self._starts, place) - 1
         step = self.step(k)
-        i = place - self._starts[k]
-        before = step.stages[i - 1].belief if i else self.before(k)
-        frame = frame_of(step, i, before, place, self.scenario)
+        if self._shown is None or self._shown[0] != place or self._shown[1] is not step:
+            i = place - self._starts[k]
+            before = step.stages[i - 1].belief if i else self.before(k)
+            self._shown = place, step, frame_of(step, i, before, place, self.scenario)
+        frame = self._shown[2]
         if self.findings is None:
             return frame
         begins = k in self.findings.begins and place + 1 == self._starts[k + 1]

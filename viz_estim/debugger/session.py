@@ -165,6 +165,9 @@ class Session(Moving):
         for branch in self.branches:
             if branch.file and path.resolve() in (branch.file.path.resolve(), partial_of(branch.file.path).resolve()):
                 raise Refused(f"{path} is where branch {branch.number} is being recorded; choose another name")
+            of = branch.source
+            if isinstance(of, Recorded) and path.exists() and path.samefile(of.run.path):
+                raise Refused(f"{path} is the recording that is looked into; choose another name")
         source = self.branch.source
         if isinstance(source, Recorded):
             with whole(path) as aside:

@@ -7,7 +7,7 @@ from itertools import groupby
 import numpy as np
 import rerun.blueprint as rrb
 
-from viz_estim.recording import links, schema
+from viz_estim.recording import links, plot_tabs, schema
 from viz_estim.recording.compared import Compared
 from viz_estim.recording.pictures import CANVAS, PANORAMA
 from viz_estim.recording.scene_views import Scenes, flat, view
@@ -31,13 +31,12 @@ def build(runs: list[Compared], scenes: Scenes, plots: list[Plot], notes: str) -
             white = ", truth white" if tab == "state" and any(np.isfinite(run.run.truth).any() for run in runs) else ""
             beneath += _tabs(_TABS[tab] + white, members, len(runs), named=bool(above))
     lanes = [
-        rrb.StateTimelineView(
-            origin=f"{run.path}{schema.LANES}", name=f"{run.title}: stage, and each sensor's readings"
-        )
-        for run in runs
+        plot_tabs.lanes(f"{run.path}{schema.LANES}", f"{run.title}: stage, and each sensor's readings") for run in runs
     ]
     beneath.append(rrb.Grid(*lanes, grid_columns=1 if len(runs) <= 3 else 3, name="Lanes"))
     beneath.append(links.panel(schema.NOTES, "What was compared", notes))
+    duration = max(float(run.run.time[-1] - run.run.time[0]) for run in runs)
+    beneath = [plot_tabs.show_all(tab, duration) for tab in beneath]
     tabs = rrb.Tabs(*beneath, name="over time", active_tab=0)
     rows: list[_Item] = [rrb.Tabs(*above, active_tab=0) if len(above) > 1 else above[0], tabs] if above else [tabs]
     shares = [1.0] if not above else [0.85, 1.0] if len(runs) <= 3 else [1.1, 1.0]

@@ -7,12 +7,12 @@ import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumn, TextLogColumnKind
 
 from viz_estim.core.consistency import band
-from viz_estim.recording import links, schema
-from viz_estim.recording.blueprints import graph
+from viz_estim.recording import links, plot_tabs, schema
 from viz_estim.recording.compared import Alone, is_figure
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.lines import shown
 from viz_estim.recording.pictures import CANVAS
+from viz_estim.recording.plot_tabs import graph
 from viz_estim.recording.scene_views import Scenes, view
 from viz_estim.recording.sheet import titled
 
@@ -31,9 +31,10 @@ def build(alone: Alone, scenes: Scenes, findings: int, markdown: str) -> rrb.Blu
     if findings:
         columned = rrb.archetypes.TextLogColumns(text_log_columns=columns)
         texts.append(rrb.TextLogView(origin=LIST, name="Click a time to go there", columns=columned))
-    lanes = rrb.StateTimelineView(origin=schema.LANES, name="Lanes: findings, stages, readings")
+    lanes = plot_tabs.lanes(schema.LANES, "Lanes: findings, stages, readings")
     spatial = _spatial(alone, scenes)
-    tabs = [tab for title, plots in _evidence(alone) for tab in _tabs(title, plots)]
+    duration = float(alone.run.time[-1] - alone.run.time[0])
+    tabs = [plot_tabs.show_all(tab, duration) for title, plots in _evidence(alone) for tab in _tabs(title, plots)]
     right: list[_Item] = [
         *([rrb.Tabs(*spatial, active_tab=0)] if spatial else []),
         *([rrb.Tabs(*tabs, active_tab=0)] if tabs else []),
@@ -41,12 +42,13 @@ def build(alone: Alone, scenes: Scenes, findings: int, markdown: str) -> rrb.Blu
     ]
     sensors = {name.partition(".")[2] for name in alone.run.inputs if "." in name}
     count = findings + len(sensors) + 1 + bool(alone.run.labels)  # a lane is some 40 pixels high
-    low = min(0.42, 0.06 + 0.045 * count)
-    rest = (1 - low) / max(1, len(right) - 1)
+    low = min(0.5, 0.05 + 0.043 * count)
+    parts = [2.0] * bool(spatial) + [3.0] * bool(tabs)  # the evidence is more to read than the scene
+    rest = [(1 - low) * part / sum(parts) for part in parts]
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(*texts, row_shares=[3, 1][: len(texts)]),
-            rrb.Vertical(*right, row_shares=[rest] * (len(right) - 1) + [low]),
+            rrb.Vertical(*right, row_shares=[*rest, low]),
             column_shares=[2, 3],
         ),
         rrb.TimePanel(timeline="time", state="collapsed"),
@@ -97,7 +99,7 @@ def _innovations(alone: Alone) -> list[_Plots]:
             top = rrb.ScalarAxis(range=(0.0, 4 * band(dof)[1]))
             views = [graph("nis", name, f"NIS {name}", top)]
             for axis, unit in zip(part.axes, part.axis_units, strict=True):
-                views.append(graph("innovation", f"{name}.{axis}", titled(name, axis, shown(unit)[0], "innov.")))
+                views.append(graph("innovation", f"{name}.{axis}", titled(name, axis, shown(unit)[0])))
             groups.append(views)
     return groups
 
@@ -117,17 +119,22 @@ def _errors(alone: Alone) -> list[_Plots]:
 def _belief(alone: Alone) -> list[_Plots]:
     if not alone.run.labels:
         return []
-    return [
-        [graph("probability", "labels", "Probability of each label", rrb.ScalarAxis(range=(0.0, 1.0)), legend=True)]
-    ]
+    return [[plot_tabs.probabilities()]]
 
 
 def _figures(alone: Alone) -> list[_Plots]:
     groups = [
         [
-            graph("figure", f"{table.name}.{name}", f"{table.name}: {name}")
-            for name, values in table.values.items()
-            if is_figure(name, values) and np.isfinite(values).any()
+            graph("figure", f"{table.name}.{name}", f"{table.name}: {words}")
+            for name, words in plot_tabs.figure_names(
+                [
+                    name
+                    for name, values in table.values.items()
+                    if is_figure(name, values) and np.isfinite(values).any()
+                ],
+                fit=_registered(alone),
+                particles=alone.run.properties.get("particles", {}).get("count"),
+            ).items()
         ]
         for table in alone.run.stages.values()
     ]

@@ -25,7 +25,8 @@ KEPT = 4000  # particles of a cloud at most: more are thinned by weight
 
 
 class Layout:
-    """space: the state's, as a product (of nothing, where the belief is over labels); inputs: the sensors on ticks.
+    """space: the state's, as a product (of nothing, where the belief is over labels); inputs: the sensors on ticks;
+    duration: in s, as far as it is known beforehand.
 
     stages: per stage the shape (as JSON: a list) or the space of each field; sensors: the spaces of those that
     innovations came from; reach: about how long their readings are; silent: by sensor the steps at which a reading was
@@ -41,6 +42,7 @@ class Layout:
         known = {name: np.isfinite(truth[:, at]).all(1) for name, at in self.space.at.items()}
         self.true_parts = [name for name, rows in known.items() if rows.any()]
         self.gapless = {name for name in self.true_parts if known[name].all()}
+        self.duration = scenario.ticks[-1].time - scenario.ticks[0].time
         parts = self.space.parts.items()
         self.position = next((name for name, part in parts if is_position(part) or isinstance(part, SE2)), None)
         self.heading = next((name for name, part in parts if isinstance(part, (SO2, SE2))), None)

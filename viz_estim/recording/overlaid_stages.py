@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from viz_estim.core.consistency import band, nis
+from viz_estim.core.consistency import FIT, band, nis
 from viz_estim.core.measurement import split
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.recording.columns import Times
 from viz_estim.recording.compared import Compared, is_figure
 from viz_estim.recording.layout import as_product
+from viz_estim.recording.plot_tabs import figure_names
 from viz_estim.recording.reader import Run
 from viz_estim.recording.sheet import Sheet, titled
 from viz_estim.recording.tables import StageTable
@@ -28,10 +29,11 @@ def draw(sheet: Sheet) -> None:
         _draw_moved(sheet, one)
     for one in sheet.runs:
         for table in one.run.stages.values():
-            for name, values in table.values.items():
-                if is_figure(name, values):
-                    at = sheet.times(one, table.place, table.step)
-                    sheet.line("figure", f"{table.name}.{name}", one, at, values, table.name, f"{table.name}: {name}")
+            numbers = [name for name, values in table.values.items() if is_figure(name, values)]
+            clouds = 0 if "particles" in one.run.properties else None
+            for name, words in figure_names(numbers, fit=table.values.keys() >= FIT, particles=clouds).items():
+                at, title = sheet.times(one, table.place, table.step), f"{table.name}: {words}"
+                sheet.line("figure", f"{table.name}.{name}", one, at, table.values[name], table.name, title)
 
 
 def _draw_residuals(sheet: Sheet, one: Compared, table: StageTable, space: Product, at: Times) -> None:

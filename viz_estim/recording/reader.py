@@ -14,11 +14,12 @@ import pyarrow as pa
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
-from viz_estim.core.consistency import summary
+from viz_estim.core.consistency import FIT, summary
 from viz_estim.core.descriptions import rebuild
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
 from viz_estim.errors import BadInput
+from viz_estim.recording import schema
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.rescue import whole
 from viz_estim.recording.tables import Gathered, StageTable, ends, fill_in, table_of, work_out
@@ -104,6 +105,8 @@ class Run:
         if self.error is not None:
             counts[-1] = False
         last = self.step[counts][-1] if counts.any() else -1
+        if any(table.values.keys() >= FIT for table in self.stages.values()):
+            counts &= self.step == last
         innovations = []
         for table in self.stages.values():
             if "innovation.residual" in table.values:
@@ -138,8 +141,8 @@ def load(path: str | Path, *, points: bool | None = True) -> Run:
             error = _texts(chunk.to_record_batch()).get("TextLog:text")
         elif entity.startswith("/stages/"):
             keep = "particles" in properties if points is None else points  # properties come first
-            stages.setdefault(entity.removeprefix("/stages/"), Gathered(keep)).add(chunk.to_record_batch())
-    if properties.keys() & {"space", "labels"} and not steps.times:
+            stages.setdefault(entity, Gathered(keep)).add(chunk.to_record_batch())
+    if properties.keys() & {"space", "labels"} and not (steps.times and (stages or "result" in properties)):
         raise NotARun(f"{path}: the run was cut off before its first steps were written")
     if not properties.keys() & {"space", "labels"}:
         raise NotARun(f"{path}: holds no run of viz_estim (make one with `viz-estim run`)")
@@ -154,6 +157,8 @@ def load(path: str | Path, *, points: bool | None = True) -> Run:
     if labels:
         truth = steps.column("truth.label", (1,))
     fields = facts.get("stages", {})
+    names = {schema.stage(name): name for name in fields}
+    stages = {names.get(entity, entity.removeprefix("/stages/")): rows for entity, rows in stages.items()}
     known = [*(name for name in fields if name in stages), *(name for name in stages if name not in fields)]
     kept = int(facts.get("particles", {}).get("kept", 0))
     tables = {name: table_of(name, stages[name], space, fields.get(name, {}), kept) for name in known}
@@ -167,6 +172,8 @@ def load(path: str | Path, *, points: bool | None = True) -> Run:
 
 
 def _chunks(path: Path) -> Iterator[Any]:
+    if path.is_dir():
+        raise BadInput(f"{path}: is a folder, expected a recording")
     if not path.is_file():
         raise BadInput(f"{path}: no such recording")
     try:

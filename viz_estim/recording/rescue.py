@@ -7,8 +7,12 @@ import os
 import shutil
 import struct
 import tempfile
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
+
+from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
 
 # An .rrd stream is a header of 12 bytes and messages of two little-endian uint64, kind and length, and a payload; where
 # it was ended well, a footer follows, whose last 12 bytes are its mark and the number of its entries.
@@ -28,6 +32,17 @@ def whole(path: Path) -> Iterator[Path]:
         with copy.open("r+b") as file:
             file.truncate(end)
         yield copy
+
+
+def has_rows(path: Path) -> bool:
+    """Whether there is any row on a timeline. True where it is no stream that we know, or a damaged one (others judge
+    it)."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RerunWarning)  # of a run that was killed
+            return any(not chunk.is_static for chunk in RrdReader(path).stream())
+    except (ValueError, OSError, RuntimeError) as error:
+        return path.stat().st_size > 0 and "No recording store" not in str(error)
 
 
 def _sound_end(path: Path) -> int:

@@ -6,9 +6,11 @@ all stages of the run). A row that only clears what a past stage drew carries `s
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+import rerun as rr
 
 Colour = tuple[int, int, int]
 
@@ -65,10 +67,10 @@ def line_colours(count: int) -> list[Colour]:
 
 
 def shades(colour: Colour, count: int) -> list[Colour]:
-    """The colour of a sensor, for each of its components: full, pale, dark, and again."""
+    """The colour of a sensor, for each of its components: full, dark, pale, and again."""
     r, g, b = colour
     pale = (r // 2 + 125, g // 2 + 125, b // 2 + 125)
-    return [((r, g, b), pale, (r // 2, g // 2, b // 2))[i % 3] for i in range(count)]
+    return [((r, g, b), (r // 2, g // 2, b // 2), pale)[i % 3] for i in range(count)]
 
 
 def by_weight(share: np.ndarray) -> np.ndarray:
@@ -94,23 +96,29 @@ _DISTANCES = _ramp((70, 140, 255), (255, 60, 60))
 
 
 def stage(name: str) -> str:
-    return f"/stages/{name}"
+    return f"/stages/{as_part(name)}"
 
 
 def drawn(name: str, field: str) -> str:
-    return f"{WORLD}/{name}/{field}"
+    return f"{WORLD}/{as_part(name)}/{field}"
 
 
 def sensor(name: str) -> str:
-    return f"/sensors/{name}"
+    return f"/sensors/{as_part(name)}"
 
 
 def plot(group: str, component: str) -> str:
-    return f"{PLOTS}/{group}/{component}"
+    return f"{PLOTS}/{group}/{as_part(component)}"
 
 
 def lane(name: str) -> str:
-    return f"{LANES}/{name}"
+    return f"{LANES}/{as_part(name)}"
+
+
+@cache
+def as_part(name: str) -> str:
+    """A person's name as it stands in an entity's path: blanks and the like are escaped, slashes part it."""
+    return "/".join(rr.escape_entity_path_part(part) for part in name.split("/") if part) or "_"
 
 
 class Entry(NamedTuple):

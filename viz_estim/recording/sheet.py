@@ -9,7 +9,7 @@ import rerun as rr
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
-from viz_estim.recording import schema
+from viz_estim.recording import plot_tabs, schema
 from viz_estim.recording.columns import Times
 from viz_estim.recording.compared import Clock, Compared
 from viz_estim.recording.lines import Lines, Series, shown
@@ -97,5 +97,5 @@ class Sheet:
 
 def titled(name: str, axis: str, unit: str, what: str = "") -> str:
     """`attitude x error [deg]`, but `heading error [deg]` where the axis adds nothing."""
-    words = [name, "" if axis in (name.partition("/")[0], "angle") else axis, what, f"[{unit}]" if unit else ""]
+    words = [plot_tabs.titled(name, axis), what, f"[{unit}]" if unit else ""]
     return " ".join(word for word in words if word)

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +16,18 @@ import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import ViewerClient, ViewerState
 
 from viz_estim.recording import links
-from viz_estim.recording.rescue import whole
+from viz_estim.recording.moments import goal_of, polls
+from viz_estim.recording.rescue import has_rows, whole
 
-START_S, SEEK_S, LOAD_S, LOAD_BYTES_PER_S = 30.0, 2.0, 10.0, 10e6  # the longest waits, for slow machines
+# The longest waits, for slow machines: until it answers, for a moment that is not there yet, until a file is loaded.
+ANSWER_S, SEEK_S, LOAD_S, LOAD_BYTES_PER_S = 30.0, 2.0, 10.0, 10e6
 SETTLING_FRAMES = 8  # before a picture that may be the last one; most layouts are done after three
 
 # What it logs also pops up in the picture for seconds. Let through are the lines with its address, warnings and errors,
 # but not the warnings at its start, which are about the machine: no graphics card, a container.
 QUIET = "egui_wgpu=error,re_renderer::context=error,re_viewer::native=error"
 LOG = f"warn,re_grpc_server=info,re_sdk::web_viewer=info,{QUIET}"
+_RETAKEN = "Failed to render screenshot"  # on a machine that is too busy: another was taken
 Size = tuple[int, int]  # width, height in pixels
 
 
@@ -50,7 +53,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
         # Were we killed, nobody would call close: the guard ends the viewer when our end of its pipe goes away.
         guard = ["/bin/sh", "-c", 'read line || kill -s KILL -- "-$0"', str(self._process.pid)]
         self._guard = subprocess.Popen(guard, stdin=subprocess.PIPE, **streams)
-        for _ in _polls(START_S):
+        for _ in polls(ANSWER_S):
             if (found := re.search(ready, self._printed())) or not self.alive:
                 break
         if not found:
@@ -82,10 +85,14 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
                 self._load(path, sound)
 
     def _load(self, path: Path, sound: Path) -> None:
+        nothing = f"{path}: has no data on any timeline; is it a recording?"
+        if not has_rows(sound):  # the viewer would never say so
+            was_cut = f"{path}: was cut off before any data was written; record it again"
+            raise ViewerError(nothing if sound == path else was_cut)
         self._forget()
         known = {recording.store_id for recording in self._state().recordings}
         opened = self._ask(self._client.open, str(sound)).store_ids
-        for _ in _polls(LOAD_S + path.stat().st_size / LOAD_BYTES_PER_S):
+        for _ in polls(LOAD_S + path.stat().st_size / LOAD_BYTES_PER_S):
             state = self._state()
             new = [r for r in state.recordings if (r.store_id in opened if opened else r.store_id not in known)]
             # A recording is listed from its first message on, and has timelines only once its data is there.
@@ -95,7 +102,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
                 cause = errors[-1].removesuffix(f" File path: {sound}").split(f"{sound}: ")[-1]
                 raise ViewerError(f"{path}: damaged or not a recording ({cause}); record it again")
         else:
-            raise ViewerError(f"{path}: has no data on any timeline; is it a recording?")
+            raise ViewerError(nothing)
         self._ask(self._client.set_time, play_state="paused")
         for recording in new:
             blueprint = self._ask(self._client.get_blueprint, store_id=recording.store_id).blueprint
@@ -105,30 +112,26 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
     def seek(self, timeline: str, value: float | None = None, seconds: float = SEEK_S) -> None:
         """Moves the front recording's cursor, and waits until it is there; a moment still on its way is waited for.
 
-        `step` and `stage` are counted from 0, `time` is in seconds; None is the timeline's end.
+        `step` and `stage` are counted from 0, `time` is in seconds; None is the timeline's end. seconds: the longest
+        wait for a moment that is not there yet; one that is there is gone to however slow the viewer draws.
         """
-        sent, problem = None, "no recording is open; open one first"
-        for _ in _polls(seconds):
+        sent = None
+        for waited in polls(max(seconds, ANSWER_S)):
             state = self._state()
-            for front in [recording for recording in state.recordings if recording.store_id == state.active_recording]:
-                problem = f"no timeline {timeline!r}; choose from: {', '.join(line.name for line in front.timelines)}"
-                for line in [line for line in front.timelines if line.name == timeline]:
-                    scale, slack = (1, 0) if line.time_type == "sequence" else (1e9, 1e6)  # ns; times are typed rounded
-                    first, last = line.start or 0, line.end or 0
-                    target = last if value is None else round(value * scale)
-                    problem = f"{timeline} {value} is not recorded; choose from {first / scale:g} to {last / scale:g}"
-                    if first - slack <= target <= last + slack:
-                        goal = (timeline, min(max(target, first), last))
-                        if sent == goal == (front.current_timeline, front.current_time):
-                            return
-                        # `sequence` passes the integer as it is, on timelines of every kind.
-                        self._ask(self._client.set_time, timeline, sequence=goal[1], play_state="paused")
-                        sent, problem = goal, "the cursor did not stay where it was put; try again"
+            goal, at, problem = goal_of(state, timeline, value)
+            if goal is None and waited >= seconds:
+                break
+            if goal is not None:
+                if sent == goal == at:
+                    return
+                # `sequence` passes the integer as it is, on timelines of every kind.
+                self._ask(self._client.set_time, timeline, sequence=goal[1], play_state="paused")
+                sent = goal
         raise ViewerError(problem)
 
     def front(self, but: Collection[str] = (), seconds: float = LOAD_S) -> str:
         """The location of the recording in front, for `show`; waits until it has data and is none of `but`."""
-        for _ in _polls(seconds):
+        for _ in polls(seconds):
             with contextlib.suppress(ViewerError):  # nothing is open yet
                 state = self._state()
                 there = any(one.store_id == state.active_recording and one.timelines for one in state.recordings)
@@ -162,7 +165,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
     def snapshot(self, path: str | Path, settle: float = 30.0) -> bool:
         """Writes the whole viewer as a PNG, whole or not at all; False if it still changed after `settle` seconds."""
         png, path, part = b"", Path(path), Path(f"{path}.{os.getpid()}.part")
-        for _ in _polls(settle):
+        for _ in polls(settle):
             self._pass_frames()
             before, png = png, self._ask(self._client.take_screenshot)
             if still := png == before and not self._state().loading:
@@ -197,8 +200,14 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
     def _ask(self, method: Callable[..., Any], *arguments: object, **options: object) -> Any:
         if self._closed:
             raise ViewerError("the viewer was closed; start another")
+        began = time.monotonic()
         try:
-            return method(*arguments, **options)
+            while True:
+                try:
+                    return method(*arguments, **options)
+                except TimeoutError:  # it is busy drawing
+                    if not self.alive or time.monotonic() > began + ANSWER_S:
+                        raise
         except (OSError, RuntimeError, ValueError) as error:
             with contextlib.suppress(subprocess.TimeoutExpired):  # a connection breaks before its process has ended
                 self._process.wait(1.0)
@@ -221,7 +230,8 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
         self._seen = max((entry.sequence for entry in self._ask(self._client.get_logs)), default=0)
 
     def _logged(self, *levels: str) -> list[str]:
-        entries = [entry for entry in self._ask(self._client.get_logs, self._seen) if entry.level in levels]
+        known = [entry for entry in self._ask(self._client.get_logs, self._seen) if entry.level in levels]
+        entries = [entry for entry in known if not entry.message.startswith(_RETAKEN)]
         return [" ".join(f"viewer: {entry.level.lower()}: {entry.message}".split()) for entry in entries]
 
     def _printed(self) -> str:
@@ -271,14 +281,8 @@ def open_files(paths: list[Path], *, web: bool = False) -> None:
 
 
 def _existing(path: str | Path) -> Path:
+    if Path(path).is_dir():
+        raise ViewerError(f"{path}: is a folder, expected a recording")
     if not Path(path).is_file():
         raise ViewerError(f"{path}: no such file; viz-estim run writes recordings")
     return Path(path).resolve()
-
-
-def _polls(seconds: float) -> Iterator[None]:
-    deadline = time.monotonic() + seconds
-    yield
-    while time.monotonic() < deadline:
-        time.sleep(0.02)
-        yield

@@ -1,0 +1,79 @@
+"""What a newcomer stumbles over: files that are none, runs cut short at once, numbers that are none."""
+
+import runpy
+import sys
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Cli
+from rerun.chunk import RrdReader
+
+import viz_estim
+from viz_estim.recording.rescue import whole
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of a person's own loop."""
+    path = tmp_path_factory.mktemp("told") / "mine.rrd"
+    with viz_estim.record(path, {"x": "m", "v": "m/s"}) as rec:
+        for k in range(30):
+            rec.stage("update", mean=[k, 1], cov=np.eye(2))
+            rec.step(time=0.1 * k, truth=[k, 2])
+    return path
+
+
+def test_show_says_nothing_of_data_that_it_knows_nothing_of(told: Path, cli: Cli) -> None:
+    done = cli("show", told)
+    assert (done.code, done.err) == (0, "")
+    assert "seed" not in done.out
+    assert "set:" not in done.out
+    assert "state_rmse_m             0\n" in done.out
+    assert "state_rmse_mps           1\n" in done.out
+
+
+@pytest.mark.filterwarnings("ignore::rerun.error_utils.RerunWarning")  # a file that was cut has no footer
+def test_a_run_cut_off_before_its_first_stages_says_so(told: Path, tmp_path: Path, cli: Cli) -> None:
+    content, cut = told.read_bytes(), tmp_path / "cut.rrd"
+    end = next(n for n in range(10_000, len(content), 500) if _has_steps_alone(content[:n], cut))
+    cut.write_bytes(content[:end])
+    for command in (["show"], ["diagnose"], ["compare", told]):
+        done = cli(*command, cut)
+        assert (done.code, done.out) == (2, "")
+        assert f"{cut}: the run was cut off before its first steps were written" in done.err
+
+
+def _has_steps_alone(content: bytes, path: Path) -> bool:
+    path.write_bytes(content)
+    with whole(path) as sound:
+        entities = {chunk.entity_path for chunk in RrdReader(sound).stream()}
+    return "/steps" in entities and not any(entity.startswith("/stages") for entity in entities)
+
+
+@pytest.mark.parametrize("command", [["show"], ["diagnose"], ["snapshot", "-o", "a.png"], ["open"], ["debug"]])
+def test_a_folder_is_no_recording(command: list[str], tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "runs.rrd").mkdir()
+    done = cli(command[0], tmp_path / "runs.rrd", *command[1:])
+    assert (done.code, done.out) == (2, "")
+    assert "runs.rrd: is a folder, expected a recording" in done.err
+
+
+def test_what_is_no_number_is_named(tmp_path: Path) -> None:
+    rec = viz_estim.record(tmp_path / "a.rrd")
+    with pytest.raises(ValueError, match="stage update: note: expected numbers, got 'turning'"):
+        rec.stage("update", mean=[1], cov=[[1]], note="turning")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="stage update: mean: expected numbers, got 'fast'"):
+        rec.stage("update", mean="fast", cov=[[1]])  # type: ignore[arg-type]
+    rec.stage("update", mean=[1], cov=[[1]])
+    with pytest.raises(ValueError, match="step 0: expected a time in seconds, got datetime"):
+        rec.step(time=datetime(2026, 1, 1))  # type: ignore[arg-type]
+
+
+def test_the_package_is_a_program(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["viz-estim", "show", "nowhere.rrd"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("viz_estim", run_name="__main__")
+    assert ended.value.code == 2
+    assert "nowhere.rrd: no such recording" in capsys.readouterr().err

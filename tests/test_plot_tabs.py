@@ -1,0 +1,95 @@
+"""The tabs of plots: none crowded, each told what its colours are, numbers named in words."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import rerun.blueprint as rrb
+
+from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product
+from viz_estim.recording import plot_tabs
+
+XYZ = ("x", "y", "z")
+
+
+def layout(space: Product, **known: Any) -> Any:
+    """A layout of that state, with a truth and a gain, and nothing else unless it is said."""
+    nothing = {"labels": (), "stages": {"update": {"gain": {"shape": [2, 1]}}}, "sensors": {}, "matched": False}
+    place = list(known.get("sensors", {})).index
+    given = {"particles": 0, "duration": 9.0, "true_parts": list(space.parts), "place": place, "space": space}
+    return SimpleNamespace(**nothing | given | known)
+
+
+def names(tabs: list[Any]) -> list[str]:
+    return [tab.name for tab in tabs]
+
+
+def plots(tab: Any) -> list[rrb.TimeSeriesView]:
+    return [view for row in tab.contents for view in row.contents]
+
+
+def legends(tabs: list[Any]) -> list[str]:
+    """The plots that have a legend."""
+    shown = [view for tab in tabs for view in plots(tab)]
+    return [v.name for v in shown if v.properties["PlotLegend"].visible.as_arrow_array()[0].as_py()]
+
+
+def test_a_large_state_has_several_tabs_and_no_crowded_one() -> None:
+    parts = {name: Euclidean(XYZ, unit) for name, unit in {"position": "m", "velocity": "m/s", "bias": "m/s²"}.items()}
+    state = Product(**parts, attitude=SO3(), gyro_bias=Euclidean(XYZ, "rad/s"))
+    tabs = plot_tabs.tabs(layout(state, sensors={"pose": Product(position=Euclidean(XYZ, "m"), attitude=SO3())}))
+    assert names(tabs) == [
+        "Innovations", "Errors", "State: estimate amber, truth white", "State 2", "σ", "What moved it",
+        "What moved it 2",
+    ]  # fmt: skip
+    assert max(len(tab.contents) for tab in tabs) <= 5
+    assert sum(len(plots(tab)) for tab in tabs if tab.name.startswith("State")) == len(state.names)
+    assert legends(tabs) == ["position σ [m]", "K·ν on position x [σ before]"]  # the others' axes are the same
+
+
+def test_a_small_state_has_its_sigma_beneath_it_and_names_who_reads_it() -> None:
+    place = Euclidean(("x", "y"), "m")
+    state = Product(position=place, heading=SO2())
+    (_, tab, _) = plot_tabs.tabs(layout(state, sensors={"gps": place}, true_parts=["heading"]))
+    assert tab.name == "State: estimate amber, truth white, gps cyan"
+    assert [view.name for view in plots(tab)] == [
+        "position x [m]", "position y [m]", "heading [deg]", "position σ [m]", "heading σ [deg]"
+    ]  # fmt: skip
+    assert legends([tab]) == ["position σ [m]"]
+
+
+def test_a_pose_says_that_its_sigma_has_two_units() -> None:
+    (tab,) = plot_tabs.tabs(layout(Product(pose=SE2()), true_parts=[], stages={}))
+    assert (tab.name, plots(tab)[-1].name) == ("State: estimate amber", "pose σ [m, rad]")
+
+
+@pytest.mark.parametrize(
+    ("name", "axis", "title"),
+    [("accel", "x", "accel x"), ("heading", "angle", "heading"), ("range/1", "range", "range/1"), ("y", "y", "y"),
+     ("state", "vx", "vx"), ("range", "range0", "range0"), ("range", "rangefinder", "range rangefinder")],
+)  # fmt: skip
+def test_a_title_says_nothing_twice(name: str, axis: str, title: str) -> None:
+    assert plot_tabs.titled(name, axis) == title
+
+
+@pytest.mark.parametrize(("duration", "link"), [(59.0, 2), (61.0, 1)])
+def test_plots_zoom_together_but_of_a_long_run_they_show_all(duration: float, link: int) -> None:
+    (tab,) = plot_tabs.tabs(layout(Product(x=Euclidean(["x"])), stages={}, true_parts=[], duration=duration))
+    axes = [view.properties["TimeAxis"] for view in plots(tab)]
+    assert {axis.link.as_arrow_array()[0].as_py() for axis in axes} == {link}
+    assert {axis.view_range is None for axis in axes} == {link == 2}
+
+
+def test_single_numbers_stand_one_below_the_other_and_are_named_in_words() -> None:
+    one = {"shape": []}
+    stages = {"weigh": {"evidence": one, "ess": one}, "resample": {"distinct": one, "ess": one, "own": one}}
+    known = layout(Product(pose=SE2()), true_parts=[], stages=stages, particles=1200)
+    figures = plot_tabs.tabs(known)[0]
+    assert figures.name == "Figures"
+    assert [len(row.contents) for row in figures.contents] == [2, 2, 1]
+    assert [view.name for view in plots(figures)] == [
+        "weigh: log-evidence of the reading", "weigh: effective sample size, of 1200",
+        "resample: effective sample size, of 1200", "resample: distinct ancestors, of 1200", "resample: own",
+    ]  # fmt: skip
+    plain = layout(Product(x=Euclidean(["x"])), stages={"update": {"ess": one, "rmse": one}}, true_parts=[])
+    assert [view.name for view in plots(plot_tabs.tabs(plain)[0])] == ["update: ess", "update: rmse"]

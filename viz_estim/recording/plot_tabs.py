@@ -1,0 +1,228 @@
+"""The plots over time, in tabs: is the filter right and does it know, single numbers, the state, what moved it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import rerun.blueprint as rrb
+from rerun.encodings import TimeRange
+
+from viz_estim.core.consistency import band
+from viz_estim.core.descriptions import describe
+from viz_estim.core.spaces import Euclidean, Space
+from viz_estim.recording import schema
+from viz_estim.recording.layout import Layout
+
+_Item = rrb.Container | rrb.View
+_MANY = 5  # rows of plots that one tab holds
+_READABLE = 4  # rows of a tab at most where they can as well be in two
+_MINUTE = 60.0  # s
+# What the single numbers of our own stages mean, those first that say most.
+_OF_CLOUDS = {
+    "evidence": "log-evidence of the reading",
+    "ess": "effective sample size",
+    "distinct": "distinct ancestors",
+}
+_OF_FITS = {"rmse": "RMSE of the matches [m]", "count": "matches", "converged": "1 when the matches repeat"}
+_COUNTED = ("ess", "distinct")  # of all particles
+
+
+def figure_names(fields: list[str], *, fit: bool, particles: int | None) -> dict[str, str]:
+    """By field, what a stage's single numbers mean; a person's own are called as they call them. fit: the run is a
+    registration; particles: how many there are, None where there are none, 0 where that differs."""
+    known = _OF_FITS if fit else {} if particles is None else _OF_CLOUDS
+    fields = sorted(fields, key=lambda field: list(known).index(field) if field in known else len(known))
+    return {f: known.get(f, f) + (f", of {particles}" if particles and f in _COUNTED else "") for f in fields}
+
+
+def lanes(origin: str, name: str) -> rrb.StateTimelineView:
+    """Lanes, of the whole run."""
+    return rrb.StateTimelineView(origin=origin, name=name, time_view=_whole_run())
+
+
+def show_all(item: _Item, duration: float) -> _Item:
+    """The same, where plots show the whole of a long run. Plots that are linked, so that they zoom together, show a
+    minute around the cursor, half of which is empty at first."""
+    if duration > _MINUTE:
+        for view in _views(item):
+            if isinstance(view, rrb.TimeSeriesView):
+                view.properties["TimeAxis"] = _whole_run()
+    return item
+
+
+def _views(item: _Item) -> list[rrb.View]:
+    return [view for inner in item.contents for view in _views(inner)] if isinstance(item, rrb.Container) else [item]
+
+
+def _whole_run() -> rrb.TimeAxis:
+    whole = TimeRange(start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite())
+    return rrb.TimeAxis(link="Independent", view_range=whole)
+
+
+def tabs(layout: Layout) -> list[_Item]:
+    """All tabs, the one that says most first."""
+    return [show_all(tab, layout.duration) for tab in _tabs(layout)]
+
+
+def _tabs(layout: Layout) -> list[_Item]:
+    if layout.labels:
+        return [rrb.Vertical(probabilities(), name="Belief")]
+    health, figures = _health(layout), _figures(layout)
+    # A registration's fit says more than its errors; without a truth there is no error at all.
+    first = [*figures, *health] if layout.matched or not layout.true_parts else [*health[:1], *figures, *health[1:]]
+    return [*first, *_state(layout), *_moved(layout)]
+
+
+def probabilities() -> rrb.TimeSeriesView:
+    """Of each label; the bars beside it are its legend."""
+    name = "Probability of each label, in the colour of its bar"
+    return graph("probability", "labels", name, rrb.ScalarAxis(range=(-0.02, 1.02)))
+
+
+def _health(layout: Layout) -> list[_Item]:
+    """Is the filter right, and does it know: errors, innovations, NIS; in two tabs where one would be crowded."""
+    errors: list[_Item] = []
+    for name, part in layout.space.parts.items():
+        if name in layout.true_parts:
+            views = [
+                graph("error", f"{name}.{axis}", f"{titled(name, axis)} error{unit_of(part, i)} ±3σ")
+                for i, axis in enumerate(part.axes)
+            ]
+            errors += _rows(views)
+    what = " innov." if len(layout.sensors) < 4 else ""  # four in a row leave no place for the word
+    views = [
+        graph("innovation", f"{name}.{axis}", f"{titled(name, axis)}{what}{unit_of(space, i)} ±3σ")
+        for name, space in layout.sensors.items()
+        for i, axis in enumerate(space.axes)
+    ]
+    widths = [len(space.axes) for space in layout.sensors.values()]
+    innovations = _rows(views, widths)
+    if layout.sensors:
+        bands = []
+        for name, space in layout.sensors.items():
+            dof = len(space.axes)
+            axis = rrb.ScalarAxis(range=(0.0, 3 * band(dof)[1]))
+            title = f"NIS {name}: {dof} expected, 95 % between the lines" if len(layout.sensors) < 3 else f"NIS {name}"
+            bands.append(graph("nis", name, title, axis))
+        innovations += _rows(bands)
+    if len(errors) + len(innovations) > _MANY and errors and innovations:
+        return [rrb.Vertical(*innovations, name="Innovations"), rrb.Vertical(*errors, name="Errors")]
+    rows = [*errors, *innovations]
+    return [rrb.Vertical(*rows, name="Consistency")] if rows else []
+
+
+def _figures(layout: Layout) -> list[_Item]:
+    """The single numbers of stages, over time: one below the other, so that their times are."""
+    views = []
+    for stage, fields in layout.stages.items():
+        numbers = [field for field, what in fields.items() if what.get("shape") == []]
+        named = figure_names(numbers, fit=layout.matched, particles=layout.particles or None)
+        views += [graph("figure", f"{stage}.{field}", f"{stage}: {name}") for field, name in named.items()]
+    across = -(-len(views) // _READABLE)
+    rows = [rrb.Horizontal(*views[i : i + across]) for i in range(0, len(views), max(across, 1))]
+    return [rrb.Vertical(*rows, name="Figures")] if rows else []
+
+
+def _state(layout: Layout) -> list[_Item]:
+    """What the filter says: every component of the state, and its σ beneath, or where that is much in tabs apart."""
+    rows: list[_Item] = []
+    for name, part in layout.space.parts.items():
+        views = [
+            graph("state", f"{name}.{component}", f"{titled(name, component)}{unit_of(part, i, part.units)}")
+            for i, component in enumerate(part.names)
+        ]
+        rows += _rows(views)
+    sigmas = _rows(_sigmas(layout))
+    colours = ["estimate amber", *(["truth white"] if layout.true_parts else []), *_readings(layout)]
+    name = f"State: {', '.join(colours)}"
+    if len(rows) + len(sigmas) <= _READABLE:
+        return [rrb.Vertical(*rows, *sigmas, name=name)]
+    return [*_in_tabs(rows, name, "State"), rrb.Vertical(*sigmas, name="σ")]
+
+
+def _readings(layout: Layout) -> list[str]:
+    """The sensors that read a part of the state as it is, each with its colour's name."""
+    parts = [describe(part) for part in layout.space.parts.values() if isinstance(part, Euclidean) and any(part.units)]
+    return [
+        f"{sensor} {schema.sensor_colour(layout.place(sensor))[0]}"
+        for sensor, space in layout.sensors.items()
+        if describe(space) in parts
+    ]
+
+
+def _moved(layout: Layout) -> list[_Item]:
+    """Which reading moved which direction of the state, in σ of the state before."""
+    if not any("gain" in fields for fields in layout.stages.values()):
+        return []
+    rows: list[_Item] = []
+    for name, part in layout.space.parts.items():
+        views = [
+            graph("moved", f"{name}.{axis}", f"K·ν on {titled(name, axis)} [σ before]", legend=not rows and i == 0)
+            for i, axis in enumerate(part.axes)
+        ]
+        rows += _rows(views)
+    return _in_tabs(rows, "What moved it", "What moved it")
+
+
+def _in_tabs(rows: list[_Item], first: str, others: str) -> list[_Item]:
+    """Rows in as many tabs as keep them readable."""
+    count = -(-len(rows) // _READABLE)
+    size = -(-len(rows) // max(count, 1))
+    parts = [rows[i : i + size] for i in range(0, len(rows), size)] if rows else []
+    return [rrb.Vertical(*part, name=f"{others} {i}" if i > 1 else first) for i, part in enumerate(parts, 1)]
+
+
+def _rows(views: Sequence[_Item], widths: list[int] | None = None) -> list[_Item]:
+    """The views in rows of at most four; those that belong together (`widths` of them) stay in one row."""
+    groups: list[list[_Item]] = []
+    start = 0
+    for width in widths or [len(views)]:
+        group = list(views[start : start + width])
+        start += width
+        if groups and len(groups[-1]) + width <= 4 and width < 3:
+            groups[-1] += group
+        else:
+            across = 3 if width % 3 == 0 else 4
+            groups += [group[i : i + across] for i in range(0, width, across)]
+    return [rrb.Horizontal(*group) for group in groups]
+
+
+def _sigmas(layout: Layout) -> list[_Item]:
+    """The σ of each part, one line a direction; a legend where the directions are others than in the plot before."""
+    views: list[_Item] = []
+    named: tuple[str, ...] = ()
+    for name, part in layout.space.parts.items():
+        several = ", ".join(dict.fromkeys(part.axis_units))  # which are drawn as they are, angles too
+        title = f"{name} σ{f' [{several}]' if len(set(part.axis_units)) > 1 else unit_of(part)}"
+        legend = len(part.axes) > 1 and part.axes != named
+        views.append(graph("sigma", name, title, legend=legend))
+        named = part.axes if len(part.axes) > 1 else named
+    return views
+
+
+def graph(
+    group: str, component: str, name: str, axis: rrb.ScalarAxis | None = None, *, legend: bool = False
+) -> rrb.TimeSeriesView:
+    """One plot of a group, in step with all others."""
+    return rrb.TimeSeriesView(
+        origin=schema.plot(group, component),
+        name=name,
+        axis_y=axis,
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        # Most is settled at the end: at the start a legend would hide how it began.
+        plot_legend=rrb.PlotLegend("RightTop", visible=legend),
+    )
+
+
+def titled(name: str, axis: str) -> str:
+    """`accel x`, but `range/1` or `heading` alone where the axis adds nothing, and `range0` where the name does,
+    or where it is `state`, as what has no parts is called."""
+    if axis in (name.partition("/")[0], "angle"):
+        return name
+    return axis if name == "state" or re.fullmatch(rf"{re.escape(name)}\d+", axis) else f"{name} {axis}"
+
+
+def unit_of(space: Space, i: int = 0, units: tuple[str, ...] | None = None) -> str:
+    unit = (units or space.axis_units)[i]
+    return f" [{'deg' if unit == 'rad' else unit}]" if unit else ""
