@@ -64,7 +64,7 @@ class Innovations:
         titles = [f"by {name} {axis}" if axis not in ("", name) else f"by {name}" for name, axis in names]
         for i, axis in enumerate(self._layout.space.axes):
             series = list(zip(titles, colours, moved[:, i, :].T, strict=True))
-            self._lines.draw(f"{schema.plot('moved', axis)}/{rows.name}", at, "σ", series)
+            self._lines.draw(f"{schema.plot('moved', axis)}/{schema.as_part(rows.name)}", at, "σ", series)
 
     def _colour(self, sensor: str) -> schema.Colour:
         return schema.sensor_colour(self._layout.place(sensor))[1]

@@ -8,6 +8,7 @@ import numpy as np
 import rerun as rr
 
 from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import Space
 from viz_estim.recording import schema
 from viz_estim.recording.columns import Column, Times, drawn, send, send_still, still
 
@@ -69,11 +70,18 @@ class Lines:
 @cache
 def _style(names: tuple[str, ...], colours: tuple[schema.Colour, ...], unit: str) -> list[Column]:
     """Made once for all plots that look alike: it takes longer than a hundred rows."""
-    return still(
-        rr.Measurements.from_fields(names=names, colors=colours, units=[unit] * len(names), aggregation_policy="MinMax")
-    )
+    units = [unit] * len(names)
+    return still(rr.Measurements.from_fields(names=names, colors=colours, units=units, aggregation_policy="MinMax"))
 
 
 def shown(unit: str) -> tuple[str, float]:
     """The unit in which a quantity is drawn, and the factor to it: angles in degrees."""
     return ("deg", 180 / np.pi) if unit == "rad" else (unit, 1.0)
+
+
+def sigma_plots(name: str, part: Space) -> dict[str, list[int]]:
+    """The plots that show the σ of a part of the state, and the directions in each: one a unit, for a metre and a
+    degree have no scale in common."""
+    units = list(dict.fromkeys(part.axis_units))
+    names = {unit: name if len(units) == 1 else f"{name}.{shown(unit)[0] or 1}" for unit in units}
+    return {names[unit]: [i for i, of in enumerate(part.axis_units) if of == unit] for unit in units}

@@ -13,6 +13,7 @@ from viz_estim.core.descriptions import describe
 from viz_estim.core.spaces import Euclidean, Space
 from viz_estim.recording import schema
 from viz_estim.recording.layout import Layout
+from viz_estim.recording.lines import sigma_plots
 
 _Item = rrb.Container | rrb.View
 _MANY = 5  # rows of plots that one tab holds
@@ -193,11 +194,11 @@ def _sigmas(layout: Layout) -> list[_Item]:
     views: list[_Item] = []
     named: tuple[str, ...] = ()
     for name, part in layout.space.parts.items():
-        several = ", ".join(dict.fromkeys(part.axis_units))  # which are drawn as they are, angles too
-        title = f"{name} σ{f' [{several}]' if len(set(part.axis_units)) > 1 else unit_of(part)}"
-        legend = len(part.axes) > 1 and part.axes != named
-        views.append(graph("sigma", name, title, legend=legend))
-        named = part.axes if len(part.axes) > 1 else named
+        for plot, at in sigma_plots(name, part).items():
+            axes = tuple(part.axes[i] for i in at)
+            several = len(axes) > 1
+            views.append(graph("sigma", plot, f"{name} σ{unit_of(part, at[0])}", legend=several and axes != named))
+            named = axes if several else named
     return views
 
 

@@ -14,7 +14,7 @@ from viz_estim.recording.batch import Batch
 from viz_estim.recording.columns import Times, drawn, send, send_static, words
 from viz_estim.recording.innovations import Innovations
 from viz_estim.recording.layout import Layout
-from viz_estim.recording.lines import Lines, Series, shown
+from viz_estim.recording.lines import Lines, Series, shown, sigma_plots
 
 
 class Plots:
@@ -49,11 +49,11 @@ class Plots:
         for name, part in space.parts.items():
             x, true, var = mean[:, space.at[name]], truth[:, space.at[name]], variance[:, space.axes_at[name]]
             self._plot_state(name, part, at, x, true, var, [batch.steps[i] for i in row.tolist()])
-            unit, scale = shown(part.axis_units[0])
-            sigma = scale * np.sqrt(np.maximum(var, 0))
-            colours = schema.line_colours(len(part.axes))
-            series = [(axis, colours[i], sigma[:, i]) for i, axis in enumerate(part.axes)]
-            self._lines.draw(schema.plot("sigma", name), at, unit, series)
+            sigma, colours = np.sqrt(np.maximum(var, 0)), schema.line_colours(len(part.axes))
+            for plot, axes in sigma_plots(name, part).items():
+                unit, scale = shown(part.axis_units[axes[0]])
+                series = [(part.axes[i], colours[i], scale * sigma[:, i]) for i in axes]
+                self._lines.draw(schema.plot("sigma", plot), at, unit, series)
             if name in self._layout.true_parts:
                 error, gapless = part.minus(x, true), name in self._layout.gapless
                 for i, axis in enumerate(part.axes):

@@ -75,7 +75,7 @@ class Scenes:
                 shades = (faint * np.array(schema.AXES)).astype(int)
                 colours = [tuple(shades[i % 3]) for i in range(3 * count)]
                 style = Style(rr.Points3D, colors=colours, radii=[0.014 / faint**0.5])
-                path = f"{schema.ATTITUDE}/{rows.name}/{field}"
+                path = f"{schema.ATTITUDE}/{schema.as_part(rows.name)}/{field}"
                 self._standing.draw(rows.name, field, path, at, style, 3 * count, positions=tips(x))
             elif name == self._layout.position:
                 colour = tuple((faint * np.array(schema.ESTIMATE)).astype(int))
@@ -85,7 +85,7 @@ class Scenes:
             elif not of_state and name in self._layout.sensors and own_scene(self._layout, name):
                 size = self._layout.reach[name]
                 style = Style(rr.Points3D, colors=[schema.ESTIMATE], radii=[0.014 * size])
-                path = f"{schema.sensor(name)}/{rows.name}/{field}"
+                path = f"{schema.sensor(name)}/{schema.as_part(rows.name)}/{field}"
                 self._standing.draw(rows.name, field, path, at, style, count, positions=x)
 
     def _draw_readings(self, rows: StageRows, field: str, at: Times, kept: np.ndarray) -> None:
@@ -117,7 +117,7 @@ class Scenes:
             send_static(self._stream, f"{path}/sphere", sphere(size))
         for what, values, shade in (("measured", z, colour), ("predicted", expected, schema.ESTIMATE)):
             style = Style(rr.Arrows3D, colors=[shade], radii=[0.012 * size])
-            self._standing.draw(stage, field, f"{path}/{stage}/{what}", at, style, 1, vectors=values)
+            self._standing.draw(stage, field, f"{path}/{schema.as_part(stage)}/{what}", at, style, 1, vectors=values)
 
     def _draw_ranges(
         self, rows: StageRows, field: str, name: str, at: Times, kept: np.ndarray, z: Array, colour: schema.Colour

@@ -100,7 +100,7 @@ def stage(name: str) -> str:
 
 
 def drawn(name: str, field: str) -> str:
-    return f"{WORLD}/{as_part(name)}/{field}"
+    return f"{WORLD}/{as_part(name)}/{as_part(field)}"
 
 
 def sensor(name: str) -> str:
