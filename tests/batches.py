@@ -1,9 +1,7 @@
 """Runs that differ in their numbers alone, done side by side as one batch: what the filters' leading axes are for."""
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from itertools import islice
 from typing import Any
 
@@ -13,9 +11,12 @@ from viz_estim.core.beliefs import Gaussian
 from viz_estim.core.run import Scenario, Step, Tick, run
 from viz_estim.core.stages import Start
 from viz_estim.core.unscented import AugmentedFilter, UnscentedFilter
+from viz_estim.recording.memory import _table, collect
+from viz_estim.recording.reader import Run
+from viz_estim.recording.tables import StageTable, ends
 
 # By name, the fields that are vectors; all others of a Gaussian filter's stages are matrices.
-VECTORS = {"mean", "z", "predicted", "residual", "used", "offered", "mean_weights", "cov_weights"}
+VECTORS = {"mean", "z", "predicted", "residual", "used", "offered"}
 
 
 class Dts(np.ndarray):
@@ -28,30 +29,32 @@ class Dts(np.ndarray):
         return np.asarray(out)
 
 
-def together(scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[list[Step]]:
-    """The steps of each, as `run` takes them: in one batch, or alone where they can't (chance, a failure, particles).
+def together(scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Run]:
+    """Each one's run as `collect` has it: in one batch, or alone where they can't (chance, a failure, particles).
 
     The batch goes by the first one's estimator; that this is the others' too is seen by the last one's first steps.
     """
-    alone = [run(scenario, seed) for scenario, seed in zip(scenarios, seeds, strict=True)]
     try:
         found = _batch(scenarios)
     except Exception:  # whatever it is, alone it happens to one of them
-        return [list(steps) for steps in alone]
-    for batched, single in zip(found[-1], islice(alone[-1], 20), strict=False):
-        assert [stage.name for stage in batched.stages] == [stage.name for stage in single.stages]
-        for one, other in zip(batched.stages, single.stages, strict=True):
-            np.testing.assert_allclose(one.belief.mean, other.belief.mean, rtol=1e-7, atol=1e-9)
-            np.testing.assert_allclose(one.belief.cov, other.belief.cov, rtol=1e-7, atol=1e-9)
+        return [collect(scenario, run(scenario, seed)) for scenario, seed in zip(scenarios, seeds, strict=True)]
+    alone = collect(scenarios[-1], islice(run(scenarios[-1], seeds[-1]), 20))
+    for name, table in alone.stages.items():
+        batched, rows = found[-1].stages[name], slice(len(table.step))
+        np.testing.assert_array_equal(batched.place[rows], table.place)
+        np.testing.assert_allclose(batched.mean[rows], table.mean, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(batched.cov[rows], table.cov, rtol=1e-7, atol=1e-9)
     return found
 
 
-def _batch(scenarios: Sequence[Scenario]) -> list[list[Step]]:
-    first, steps = scenarios[0], [[] for _ in scenarios]
+def _batch(scenarios: Sequence[Scenario]) -> list[Run]:
+    first = scenarios[0]
     assert all(list(scenario.beliefs) == [0] and scenario.until is None for scenario in scenarios)
     start = [scenario.beliefs[0] for scenario in scenarios]
     belief: Any = Gaussian(start[0].space, np.stack([b.mean for b in start]), np.stack([b.cov for b in start]))
     by_points = isinstance(first.estimator, UnscentedFilter | AugmentedFilter)
+    found: dict[str, list[tuple[int, int, Any]]] = {}
+    place = 0
     for k, ticks in enumerate(zip(*(scenario.ticks for scenario in scenarios), strict=True)):
         stages: list[Any] = [Start("start", belief)] if k == 0 else []
         # A step that draws by chance fails here for want of a generator.
@@ -60,10 +63,31 @@ def _batch(scenarios: Sequence[Scenario]) -> list[list[Step]]:
             belief = stage.belief
             assert np.isfinite(belief.mean).all()
             assert np.isfinite(belief.cov).all()
-        for i, (scenario, tick) in enumerate(zip(scenarios, ticks, strict=True)):
-            truth = None if scenario.truth is None else scenario.truth[k]
-            steps[i].append(Step(k, tick, tuple(member(stage, i) for stage in stages), truth))
-    return steps
+        for stage in stages:
+            found.setdefault(stage.name, []).append((k, place, stage))
+            place += 1
+        place += not stages
+    whole = {name: _table(name, rows) for name, rows in found.items()}
+    return [_member(scenario, whole, i) for i, scenario in enumerate(scenarios)]
+
+
+def _member(scenario: Scenario, whole: dict[str, StageTable], i: int) -> Run:
+    """The run of the batch's member i: what `collect` finds of its steps without stages, and its part of the tables."""
+    steps = [
+        Step(k, tick, (), None if scenario.truth is None else scenario.truth[k])
+        for k, tick in enumerate(scenario.ticks)
+    ]
+    tables = {}
+    for name, table in whole.items():
+        values = {key: v[:, i] if v.ndim == own(key) + 2 else v for key, v in table.values.items()}
+        tables[name] = replace(table, values=values)
+    made = collect(scenario, steps)
+    return replace(made, stages=tables, ends=ends(made.step, tables, made.space, ()))
+
+
+def own(name: str) -> int:
+    """How many dimensions one value of a stage has."""
+    return 1 if name.rpartition(".")[2] in VECTORS else 2
 
 
 def _stacked(ticks: Sequence[Tick], by_points: bool) -> Tick:
@@ -81,21 +105,3 @@ def _stacked(ticks: Sequence[Tick], by_points: bool) -> Tick:
         control = control[:, None] if by_points else control
     readings = {name: np.stack([tick.measurements[name] for tick in ticks]) for name in one.measurements}
     return replace(one, dt=dt, control=control, measurements=readings, raw={})
-
-
-@cache
-def fields_of(kind: type) -> list[tuple[str, int]]:
-    """Its fields, each with the number of its own dimensions."""
-    return [(field.name, 1 if field.name in VECTORS else 2) for field in dataclasses.fields(kind)]
-
-
-def member(record: Any, i: int) -> Any:
-    """A stage, or what it holds, of the batch's member i."""
-    values = {}
-    for name, own in fields_of(type(record)):
-        value = getattr(record, name)
-        if isinstance(value, np.ndarray):
-            values[name] = value[i] if value.ndim > own else value
-        else:
-            values[name] = member(value, i) if dataclasses.is_dataclass(value) else value
-    return type(record)(**values)

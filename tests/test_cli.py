@@ -154,7 +154,7 @@ def test_simulated_files_calibrate_and_run(cli: Cli, tmp_path: Path) -> None:
     angles = viz_estim.estimate_rot(imu)
     assert [a.shape for a in angles] == [(plain["steps"],)] * 3
     assert_between(angles, -np.pi, np.pi)
-    twice = strict(cli("run", "imu-ukf", "--data", folder, "--data", imu, "--out", out, "--json"))
+    twice = strict(cli("run", "imu-gyro", "--data", folder, "--data", imu, "--out", out, "--json"))
     assert twice["steps"] == plain["steps"]
 
 

@@ -27,7 +27,7 @@ KINDS: dict[str, list[list[str]]] = {
     "clouds": [_CLOUD, [*_CLOUD, "--set=range_noise=2"]],
 }
 AT = {"attitudes": 2.5, "six robots": 2.0, "three bars": 30.0, "clouds": 2.0}
-SIZE = (900, 680)
+SIZE = (760, 600)
 
 
 @pytest.fixture(scope="module")

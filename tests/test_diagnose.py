@@ -102,7 +102,7 @@ def healthy(name: str) -> list[Run]:
         scenario = HEALTHY[name](np.random.default_rng(seed))
         scenario = replace(scenario, ticks=scenario.ticks[: STEPS.get(name)])
         scenarios.append(drawn(scenario, np.random.default_rng(1000 + seed)))
-    return [collect(*each) for each in zip(scenarios, together(scenarios, range(SEEDS)), strict=True)]
+    return together(scenarios, range(SEEDS))
 
 
 def serious(findings: list[Finding]) -> list[Finding]:

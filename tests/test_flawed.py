@@ -11,7 +11,6 @@ from batches import together
 from conftest import Cli, strict
 
 from viz_estim.diagnose import CODES, diagnose
-from viz_estim.recording.memory import collect
 from viz_estim.running import find
 from viz_estim.scenarios.flawed import FLAWED
 
@@ -27,6 +26,7 @@ SHORT: dict[str, dict[str, Any]] = {
     "beacons": {},
 }
 OTHER: dict[str, dict[str, Any]] = {
+    "gps-one-late": {"duration": 20.0},
     "process-noise-too-small": {"duration": 14.0},
     "glitches": {"duration": 20.0},
     "clipped-ranges": {"duration": 20.0},
@@ -60,7 +60,7 @@ def found(name: str) -> list[set[str]]:
         data = flaw.data(None, np.random.default_rng(seed), **SHORT[system] | OTHER.get(name, {}))
         scenario = flaw.scenario(data)
         scenarios.append(replace(scenario, ticks=scenario.ticks[: STEPS.get(name)]))
-    runs = map(collect, scenarios, together(scenarios, range(SEEDS)))
+    runs = together(scenarios, range(SEEDS))
     codes = [{finding.code for finding in diagnose(run) if finding.severity != "note"} for run in runs]
     assert set().union(*codes) <= CODES.keys()
     return codes

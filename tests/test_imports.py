@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -15,16 +16,27 @@ MODULES = {path.relative_to(HOUSE.parent).with_suffix("").as_posix(): path for p
 every_module = pytest.mark.parametrize("module", MODULES)
 
 
+@cache
+def calls_and_imports(path: Path) -> list[ast.Call | ast.Import | ast.ImportFrom]:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return [node for node in ast.walk(tree) if isinstance(node, ast.Call | ast.Import | ast.ImportFrom)]
+
+
+@cache
+def called(node: ast.Call) -> str:
+    return ast.unparse(node.func)
+
+
 def imports(module: str) -> Iterator[str]:
     """The full names of all that a module imports, wherever in it: `from a import b` gives a.b."""
     package = module.split("/")[:-1]
-    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+    for node in calls_and_imports(MODULES[module]):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = [] if node.level == 0 else package[: len(package) - node.level + 1]
             yield from (".".join([*base, *([node.module] if node.module else []), alias.name]) for alias in node.names)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("__import__", "importlib.import_module"):
+        elif called(node) in ("__import__", "importlib.import_module"):
             # A name made at run time can't be judged here: only a person's own file is imported like this, by its path.
             yield from (arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant))
 
@@ -70,12 +82,12 @@ def test_only_the_recording_imports_rerun_and_pyarrow(module: str) -> None:
 @every_module
 def test_nothing_is_unpickled(module: str) -> None:
     assert not {name.split(".")[0] for name in imports(module)} & {"pickle", "dill", "joblib", "shelve", "marshal"}
-    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+    for node in calls_and_imports(MODULES[module]):
         if isinstance(node, ast.Call):
             allowed = [k.value for k in node.keywords if k.arg == "allow_pickle"]
-            allowed += node.args[2:3] if ast.unparse(node.func) in ("np.load", "numpy.load") else []
+            allowed += node.args[2:3] if called(node) in ("np.load", "numpy.load") else []
             assert all(isinstance(value, ast.Constant) and value.value is False for value in allowed)
-            assert ast.unparse(node.func) not in ("read_pickle", "np.core.multiarray._reconstruct", "eval", "exec")
+            assert called(node) not in ("read_pickle", "np.core.multiarray._reconstruct", "eval", "exec")
 
 
 @every_module

@@ -1,5 +1,6 @@
 """Odometry and ranges to beacons: the model's derivatives, what a bias does, odd files, bad input, the real set."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,10 @@ def read(path: Path) -> PlazaData:
     return plaza.plaza([path], np.random.default_rng(0))
 
 
-def score(made: PlazaData, **parameters: Any) -> tuple[dict[str, float], float, float, int]:
-    """Metrics, mean NIS over all beacons, its band's upper end, and how many ranges were refused."""
+def score(made: PlazaData, count: int | None = None, **parameters: Any) -> tuple[dict[str, float], float, float, int]:
+    """Metrics, mean NIS over all beacons, its band's upper end, and how many ranges were refused, of `count` steps."""
     scenario = plaza.range_ekf(made, **parameters)
+    scenario = replace(scenario, ticks=scenario.ticks[:count])
     tally, nis, refused = Tally(scenario.space, max(scenario.beliefs)), [], 0
     for step in run(scenario):
         assert step.error is None
@@ -282,5 +284,5 @@ def test_on_the_real_set_the_scale_tells_all(real_data: Path) -> None:
     assert refused < 10
     metrics, nis, _, _ = score(made, range_bias="constant")
     assert (metrics["position_rmse_m"] < 1.5, nis > 1.5) == (True, True)
-    metrics, nis, _, _ = score(made, range_bias="none", gate=None)
+    _, nis, _, _ = score(made, 5000, range_bias="none", gate=None)
     assert nis > 10

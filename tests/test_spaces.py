@@ -254,3 +254,14 @@ def test_many_angles_are_wrapped_as_each_alone(spread: float) -> None:
     together = wrap(angles)
     np.testing.assert_array_equal(together, [wrap(angle) for angle in angles])
     np.testing.assert_allclose(np.exp(1j * together[:5]), np.exp(1j * angles[:5]))
+
+
+def test_products_in_turn_are_to_the_bit_those_of_pairs() -> None:
+    rng = np.random.default_rng(11)
+    steps = quaternions.exp(0.1 * rng.standard_normal((200, 3)))
+    found = np.empty((200, 4))
+    found[0] = before = quaternions.normalise(rng.standard_normal(4))
+    quaternions.accumulate(found, steps)
+    for step, product in zip(steps, found[1:], strict=False):
+        before = quaternions.multiply(before, step)
+        assert product.tobytes() == before.tobytes()

@@ -23,7 +23,7 @@ from viz_estim.recording.viewer import Viewer, ViewerError, open_files, snapshot
 
 pytestmark = pytest.mark.draws
 
-SIZE = (900, 613)
+SIZE = (600, 409)
 STEPS = 200
 Picture = Callable[[str, float], bytes]
 BAD_FILES = {
@@ -274,13 +274,17 @@ def test_open_files_on_the_web(recording: Path) -> None:
     code = "import sys; from viz_estim.recording.viewer import open_files; open_files(sys.argv[1:], web=True)"
     command = [sys.executable, "-c", code, str(recording)]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"BROWSER": "true"})
-    assert server.stdout is not None
-    address = server.stdout.readline()
-    assert address.startswith("http://127.0.0.1:")
-    family = psutil.Process(server.pid).children(recursive=True)
-    listening = [c.laddr.ip for p in family for c in p.net_connections(kind="inet") if c.status == psutil.CONN_LISTEN]
-    assert set(listening) == {"127.0.0.1"}
-    server.send_signal(signal.SIGINT)
-    server.communicate(timeout=10)
-    assert server.returncode == 0
-    assert all(gone(process) for process in family)
+    try:
+        assert server.stdout is not None
+        address = server.stdout.readline()
+        assert address.startswith("http://127.0.0.1:")
+        family = psutil.Process(server.pid).children(recursive=True)
+        connections = [c for p in family for c in p.net_connections(kind="inet")]
+        assert {c.laddr.ip for c in connections if c.status == psutil.CONN_LISTEN} == {"127.0.0.1"}
+        server.send_signal(signal.SIGINT)
+        server.communicate(timeout=10)
+        assert server.returncode == 0
+        assert all(gone(process) for process in family)
+    finally:  # were it left behind, it would take a core for itself
+        server.kill()
+        server.wait()

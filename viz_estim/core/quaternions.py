@@ -28,6 +28,19 @@ def multiply(p: Array, q: Array) -> Array:
     return (q[..., None, :] @ left)[..., 0, :]
 
 
+def accumulate(product: Array, steps: Array) -> None:
+    """Fills product (N, 4), of which the first is given: each is the one before times its step (N, 4), in that order.
+
+    To the bit what `multiply` gives in turn, without its shaping of each pair.
+    """
+    left = np.empty(16)
+    matrix, before = left.reshape(4, 4), product[0]
+    for after, step in zip(product[1:], steps, strict=False):
+        np.dot(before, _PRODUCT_MATRIX, left)
+        np.dot(step, matrix, after)
+        before = after
+
+
 def conjugate(q: Array) -> Array:
     """The inverse rotation."""
     return q * _CONJUGATE

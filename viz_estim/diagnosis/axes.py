@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from itertools import permutations, product
 
 import numpy as np
@@ -31,8 +32,13 @@ def units(unit: str) -> dict[str, float]:
     return UNITS[of] if of in UNITS else {k: v for known in UNITS.values() for k, v in known.items()}
 
 
-def maps(size: int, unit: str = "") -> Iterator[tuple[str, Array]]:
+@cache
+def maps(size: int, unit: str = "") -> tuple[tuple[str, Array], ...]:
     """All signed permutations of the axes (2, 8 or 48), and the units, by what they say; the identity is left out."""
+    return tuple(_maps(size, unit))
+
+
+def _maps(size: int, unit: str) -> Iterator[tuple[str, Array]]:
     for order in permutations(range(size)):
         for signs in product((1, -1), repeat=size):
             if order != tuple(range(size)) or -1 in signs:

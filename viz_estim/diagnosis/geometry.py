@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from viz_estim.core.consistency import squared_distance
 from viz_estim.core.spaces import SO3, Euclidean
 from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.covariance import epsilon
@@ -98,10 +97,12 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         if told or not isinstance(space, Euclidean) or not 1 <= len(space.axes) <= 3 or len(readings) < 10:
             continue
         own = float(np.nansum(readings.nis))
-        candidates = list(maps(len(space.axes), space.axis_units[0]))
+        sound = np.isfinite(readings.nis) & np.isfinite(readings.z).all(1) & np.isfinite(readings.predicted).all(1)
+        z, predicted, precision = readings.z[sound], readings.predicted[sound], np.linalg.inv(readings.cov[sound])
         best, what = np.inf, ""
-        for title, M in candidates:
-            value = float(np.nansum(squared_distance(readings.z @ M.T - readings.predicted, readings.cov)))
+        for title, M in maps(len(space.axes), space.axis_units[0]):
+            off = z @ M.T - predicted
+            value = float(np.einsum("ti,tij,tj->", off, precision, off))
             if value < best:
                 best, what = value, title
         gain, explained = 0.5 * (own - best), 1 - best / max(own, 1e-300)

@@ -40,7 +40,7 @@ def imu_axes(case: Case) -> Iterator[Finding]:
         return
     turn, middle, change, steps = pieces
     own = _left(turn, middle, change)
-    candidates = list(maps(3, "rad/s"))
+    candidates = maps(3, "rad/s")
     of_rate = [_left(turn @ M.T, middle, change) for _, M in candidates]
     of_force = [
         _left(turn, middle @ M.T, change @ M.T) if abs(np.linalg.det(M)) == 1 else np.inf for _, M in candidates
@@ -132,7 +132,7 @@ def _windows(case: Case, both: Imu) -> tuple[Array, Array, Array, tuple[int, int
 
 def _left(turn: Array, middle: Array, change: Array) -> float:
     """Σ|Δg + θ × g|²."""
-    return float(np.square(change + np.cross(turn, middle)).sum())
+    return float(np.square(change + quaternions.cross(turn, middle)).sum())
 
 
 def _blamed(case: Case, both: Imu) -> str:

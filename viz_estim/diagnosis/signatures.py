@@ -149,9 +149,8 @@ def faults(case: Case) -> list[Fault]:
     q, d = len(kinds), len(case.space.axes)
     for update in updates.values():
         update.prepare(column, q)
-    g, A, b = np.zeros((d, q)), np.zeros((_STRETCHES, q)), np.zeros((_STRETCHES, q))
-    places = len(case.sequence.stage)
-    for place, stage in enumerate(case.sequence.stage):
+    g = np.zeros((d, q))
+    for stage in case.sequence.stage:
         if stage is None:
             continue
         table, row = stage
@@ -160,15 +159,18 @@ def faults(case: Case) -> list[Fault]:
         elif table.name in updates:
             update = updates[table.name]
             if update.sound[row]:
-                s = update.delta[row] - update.H[row] @ g
-                if update.counts[row]:
-                    w = update.inverse[row] @ s
-                    stretch = place * _STRETCHES // places
-                    A[stretch] += np.einsum("mq,mq->q", s, w)
-                    b[stretch] += update.residual[row] @ w
+                s = update.left[row]
+                s -= update.H[row] @ g
                 g = g + update.gain[row] @ s
         else:
             g = np.zeros((d, q))
+    A, b = np.zeros((_STRETCHES, q)), np.zeros((_STRETCHES, q))
+    for update in updates.values():
+        rows = update.sound & update.counts
+        s, w = update.left[rows], update.inverse[rows] @ update.left[rows]
+        stretch = update.table.place[rows] * _STRETCHES // len(case.sequence.stage)
+        np.add.at(A, stretch, (s * w).sum(1))
+        np.add.at(b, stretch, (update.residual[rows][:, None] @ w)[:, 0])
     if not np.isfinite(A).all():
         return []
     misfit = max(1.0, _misfit(case))
@@ -198,7 +200,8 @@ def _misfit(case: Case) -> float:
 
 
 class _Update:
-    """One update stage's rows as arrays: H, gain, S⁻¹, residual, and δ (M, m, q) of each fault at unit size."""
+    """One update stage's rows as arrays: H, gain, S⁻¹, residual, and what each fault at unit size leaves in the
+    innovation (M, m, q): δ, from which `faults` subtracts H·g."""
 
     def __init__(self, case: Case, table: StageTable) -> None:
         space = table.spaces["innovation"]
@@ -224,15 +227,15 @@ class _Update:
     def prepare(self, column: dict[tuple[str, str], int], q: int) -> None:
         predicted = self.table.values["innovation.predicted"]
         time = self.case.run.time[np.searchsorted(self.case.run.step, self.table.step)]
-        self.delta = np.zeros((len(time), len(self.space.axes), q))
+        self.left = np.zeros((len(time), len(self.space.axes), q))
         for i, (name, part) in enumerate(self.space.parts.items()):
             axes, at = self.space.axes_at[name], self.space.at[name]
             for k, (axis, unit) in enumerate(zip(part.axes, part.axis_units, strict=True)):
                 j = column[name, f"bias {axis if axis != name else 'reading'} {unit}"]
-                self.delta[:, axes.start + k, j] = self.offered[:, i]
+                self.left[:, axes.start + k, j] = self.offered[:, i]
             back = min(_BACK, len(time) - 1)
             rate = np.zeros((len(time), axes.stop - axes.start))
             if back:
                 spans = np.maximum(time[back:] - time[:-back], 1e-9)[:, None]
                 rate[back:] = part.minus(predicted[back:, at], predicted[:-back, at]) / spans
-            self.delta[:, axes, column[name, "lag"]] = -rate * self.offered[:, i, None]
+            self.left[:, axes, column[name, "lag"]] = -rate * self.offered[:, i, None]

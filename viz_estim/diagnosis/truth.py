@@ -198,11 +198,11 @@ def _maps(one: Against) -> Iterator[Cause]:
     """The best signed permutation or unit, and the best plain factor."""
     if not isinstance(one.space, Euclidean) or not 1 <= len(one.space.axes) <= 3:
         return
-    own = float((white(one, one.r) ** 2).sum())
-    M, m = one.r.shape
+    precision = np.asarray(np.linalg.inv(one.noise), float)
+    own, (M, m) = _squares(one.r, precision), one.r.shape
     best, what = np.inf, ""
     for title, A in maps(m, one.space.axis_units[0]):
-        left = float((white(one, one.z @ A.T - one.true) ** 2).sum()) / max(1.0, abs(np.linalg.det(A)) ** (2 / m))
+        left = _squares(one.z @ A.T - one.true, precision) / max(1.0, abs(np.linalg.det(A)) ** (2 / m))
         if left < best:
             best, what = left, title
     gain, explained = 0.5 * M * m * np.log(own / max(best, 1e-300)), 1 - best / max(own, 1e-300)
@@ -226,6 +226,11 @@ def _maps(one: Against) -> Iterator[Cause]:
         f"readings of {one.name} are {factor:.4g}× what the truth would give: {named(factor, one.space.axis_units[0])}",
         f"divide the readings of {one.name} by {factor:.4g}, or calibrate its scale",
     )  # fmt: skip
+
+
+def _squares(off: Array, precision: Array) -> float:
+    """Σ vᵀ·R⁻¹·v of v (M, m)."""
+    return float(np.einsum("ti,tij,tj->", off, precision, off))
 
 
 def named(factor: float, unit: str) -> str:

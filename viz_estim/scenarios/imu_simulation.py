@@ -106,8 +106,7 @@ def _integrate(rate: Array, start: Array) -> Array:
     steps = quaternions.exp(rate * _FINE)
     attitude = np.empty((len(rate), 4))
     attitude[0] = start
-    for k in range(1, len(rate)):
-        attitude[k] = quaternions.multiply(attitude[k - 1], steps[k - 1])
+    quaternions.accumulate(attitude, steps)
     return quaternions.normalise(attitude)
 
 
