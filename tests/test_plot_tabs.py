@@ -58,9 +58,10 @@ def test_a_small_state_has_its_sigma_beneath_it_and_names_who_reads_it() -> None
     assert legends([tab]) == ["position σ [m]"]
 
 
-def test_a_pose_says_that_its_sigma_has_two_units() -> None:
+def test_a_pose_has_its_sigma_in_two_plots_of_a_unit_each() -> None:
     (tab,) = plot_tabs.tabs(layout(Product(pose=SE2()), true_parts=[], stages={}))
-    assert (tab.name, plots(tab)[-1].name) == ("State: estimate amber", "pose σ [m, rad]")
+    assert tab.name == "State: estimate amber"
+    assert [view.name for view in plots(tab)[-2:]] == ["pose σ [m]", "pose σ [deg]"]
 
 
 @pytest.mark.parametrize(
