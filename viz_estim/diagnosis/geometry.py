@@ -82,7 +82,7 @@ def quaternion_norms(case: Case) -> Iterator[Finding]:
 
 
 def units_or_axes(case: Case) -> Iterator[Finding]:
-    """Readings that a map M would bring to what was expected: the gain in log-likelihood, ½Σ(|ν|² − |M·z − ẑ|²) in S.
+    """Readings that a map M would bring to what was expected: the gain in log-likelihood, ½Σ(|ν|² − |z − M⁻¹·ẑ|²) in S.
 
     If the innovations are N(0, S), a gain above log(1/α) has at most the probability α, for any one map (Markov's
     inequality on a likelihood ratio; Ville 1939).
@@ -101,7 +101,9 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         candidates = list(maps(len(space.axes), space.axis_units[0]))
         best, what = np.inf, ""
         for title, M in candidates:
-            value = float(np.nansum(squared_distance(readings.z @ M.T - readings.predicted, readings.cov)))
+            value = float(
+                np.nansum(squared_distance(readings.z - readings.predicted @ np.linalg.inv(M).T, readings.cov))
+            )
             if value < best:
                 best, what = value, title
         gain, explained = 0.5 * (own - best), 1 - best / max(own, 1e-300)

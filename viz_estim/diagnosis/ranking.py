@@ -47,6 +47,8 @@ def _follows(finding: Finding, cause: Finding) -> bool:
         # Errors of the state, from innovations of another size; and that these follow one another.
         size = cause.code in ("overconfident", "outliers") and "part" not in cause.evidence
         return size and ("part" in finding.evidence or finding.code == "coloured_innovation")
+    if finding.code in ("particles_far", "particles_collapsed") and cause.evidence.get("against") == "truth":
+        return True  # particles go where the readings and the motion send them
     if finding.tier <= cause.tier:
         return False
     anywhere = finding.code in SYMPTOMS or cause.code == "sensor_frozen"
