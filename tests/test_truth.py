@@ -48,7 +48,7 @@ WRONG: dict[str, tuple[Callable[[], Scenario], Callable[[Array], Array]]] = {
     "a root is missing": (ranges, lambda z: z**2),
     "feet for m": (ranges, lambda z: z / 0.3048),
     "1.1× what the truth would give": (ranges, lambda z: 1.1 * z),
-    "range 2 are +5": (ranges, lambda z: z + np.array([0.0, 5.0])),
+    "readings of range 2 are +4.98 m": (ranges, lambda z: z + np.array([0.0, 5.0])),
     "turned by 17°": (gps, lambda z: np.array([C * z[0] - S * z[1], S * z[0] + C * z[1]])),
     "axes +y +x": (gps, lambda z: z[::-1]),
     "body → world is taken for world → body": (pose, attitude(quaternions.conjugate)),
