@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from viz_estim.diagnosis.finding import GROSS, Finding, judge
 from viz_estim.diagnosis.fits import STRETCHES
 
 SURELY = 0.95  # of the misfit explained: no error of a linearisation looks like that
+_SHEET = 0.05  # of a motion: what the data sheet of a wheel or a gyro leaves to a calibration
 _WORLD = "the world's axes"
 _ALIKE = 1.01  # of the squares that are left: as well explained
 
@@ -182,16 +184,16 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Ar
 def _moves_as(
     label: str, unit: str, of: np.ndarray, w: Array, told: Array, dt: Array, slip: Array, tests: int
 ) -> Iterator[tuple[float, Finding]]:
-    """w = (c − 1)·Δ' + b·dt: which of the two is off, if any. By rates, so that a long step counts like others.
+    """w = (c − 1)·Δ' + b·dt: which of the two is off, if any. By rates, so that a long step counts like others. Large
+    is what is more than 5 % of the motion off, for sure.
 
     Noise of the control pulls the slope of Δ on Δ' to zero, noise of the motion that of Δ' on Δ: the factor lies
     between the two, and where 1 does too there is none.
     """
     w, told, slip = w / dt, told / dt, slip / dt
     one, truly = np.ones_like(told), told + w
-    drift, p_drift, left_drift = _slope(w, one)
-    beta, p_factor, left_factor = _slope(w, told)
-    back, p_back, _ = _slope(-w, truly)
+    steady, forth, aback = _slope(w, one), _slope(w, told), _slope(-w, truly)
+    drift, beta, back, left_drift, left_factor = steady.value, forth.value, aback.value, steady.left, forth.left
     ends = 1 / (1 + beta) if beta != -1 else np.inf, 1 + back
     by_factor = left_factor < left_drift
     share = 1 - min(left_factor, left_drift) / max(float((w**2).sum()), 1e-300)
@@ -205,8 +207,8 @@ def _moves_as(
         # Of what is predicted, against what happens: the end that has a name, or the more careful one.
         known = [f for f in ends if named(f, unit) != named(1.3, unit)]
         factor = known[0] if known else min(ends, key=lambda f: abs(f - 1))
-        p = max(p_factor, p_back)
-        severity = judge(p, tests, large=abs(factor - 1) > 0.05)
+        p = max(forth.p_beyond(0.0), aback.p_beyond(0.0))
+        severity = judge(p, tests, large=max(forth.p_beyond(_SHEET), aback.p_beyond(_SHEET)))
         sign = (
             "its sign is wrong"
             if abs(factor + 1) < 0.2
@@ -222,7 +224,8 @@ def _moves_as(
         )
         evidence: dict[str, object] = {"component": label, "factor": factor, "p": p}
     else:
-        severity = judge(p_drift, tests, large=abs(drift) > 0.05 * float(np.abs(told).mean()))
+        p_drift = steady.p_beyond(0.0)
+        severity = judge(p_drift, tests, large=steady.p_beyond(_SHEET * float(np.abs(told).mean())))
         rate = f"{unit}²" if unit.endswith("/s") else f"{unit}/s"
         cause = (
             f"the prediction misses a steady {drift:+.3g} {rate} of {label}: the control that moves it has a bias, "
@@ -236,16 +239,29 @@ def _moves_as(
         yield share, Finding("process_model", severity, None, steps, evidence | {"against": "truth"}, cause, remedy)
 
 
-def _slope(y: Array, x: Array) -> tuple[float, float, float]:
-    """The slope of y on x (M,) through zero, its p by a t-test, and Σ of the squares that are left."""
+class Slope(NamedTuple):
+    """A slope through zero, its standard error and degrees of freedom, and Σ of the squares that are left."""
+
+    value: float
+    error: float
+    dof: float
+    left: float
+
+    def p_beyond(self, size: float) -> float:
+        """The chance of such a slope where it is of this size."""
+        return float(2 * t.sf(max(abs(self.value) - size, 0.0) / max(self.error, 1e-300), self.dof))
+
+
+def _slope(y: Array, x: Array) -> Slope:
+    """Of y on x (M,), with a standard error by 20 stretches of the run where that is larger."""
     A = float(x @ x)
     if A <= 0:
-        return 0.0, 1.0, float(y @ y)
+        return Slope(0.0, 1.0, 1.0, float(y @ y))
     slope = float(x @ y) / A
     left = y - slope * x
     pieces = np.array([part.sum() for part in np.array_split(x * left, min(STRETCHES, len(y) // 5))])
     B = len(pieces)
     scatter, model = float(pieces @ pieces) * B / (B - 1) / A**2, float(left @ left) / len(y) / A
     if scatter < model * chi2.isf(0.01, B - 1) / (B - 1):
-        return slope, float(2 * t.sf(abs(slope) / np.sqrt(max(model, 1e-300)), len(y) - 1)), float(left @ left)
-    return slope, float(2 * t.sf(abs(slope) / np.sqrt(scatter), B - 1)), float(left @ left)
+        return Slope(slope, float(np.sqrt(model)), len(y) - 1, float(left @ left))
+    return Slope(slope, float(np.sqrt(scatter)), B - 1, float(left @ left))

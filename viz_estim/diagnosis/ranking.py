@@ -49,10 +49,20 @@ def _follows(finding: Finding, cause: Finding) -> bool:
         return size and ("part" in finding.evidence or finding.code == "coloured_innovation")
     if finding.code in ("particles_far", "particles_collapsed") and cause.evidence.get("against") == "truth":
         return True  # particles go where the readings and the motion send them
+    if finding.code == "process_model" and _of_the_gyro(cause):
+        return True  # which moves the prediction
+    if cause.code == "process_model" and _of_the_gyro(finding):
+        return False
     if finding.tier <= cause.tier:
         return False
     anywhere = finding.code in SYMPTOMS or cause.code == "sensor_frozen"
     return anywhere or finding.sensor == cause.sensor or None in (finding.sensor, cause.sensor)
+
+
+def _of_the_gyro(cause: Finding) -> bool:
+    """Whether a gyro is found wrong by itself, at rest or against gravity, whatever the filter makes of it."""
+    alone = "at_rest" in cause.evidence or cause.code == "units_or_axes"
+    return cause.sensor == "gyro" and alone and "against" not in cause.evidence
 
 
 def _softened(finding: Finding, cause: Finding | None) -> Finding:
