@@ -42,10 +42,14 @@ def prediction(case: Case) -> Iterator[Finding]:
     if not np.isfinite(run.truth).any():
         return
     if turned := list(_turned(case)):
-        yield from turned
+        yield from map(_by_estimate, turned)
+        return
+    moved = clouds.moves_of_means(case)
+    if moved is not None and (exchanged := _exchanged(moved.truly, moved.told, moved.step)) is not None:
+        yield _by_estimate(exchanged)
         return
     if len(moves) != 1:
-        yield from _elsewhere(case)
+        yield from map(_by_estimate, _elsewhere(case))
         return
     (table, F), row = moves[0], {int(step): k for k, step in enumerate(run.step)}
     before, _ = case.sequence.before(table)
@@ -83,7 +87,12 @@ def prediction(case: Case) -> Iterator[Finding]:
             if (found := _turns_as(name, truly, told, moving[axes[0]][2])) is not None:
                 yield found
                 return
-    yield from _best(told_of) if told_of else _elsewhere(case)
+    yield from _best(told_of) if told_of else map(_by_estimate, _elsewhere(case))
+
+
+def _by_estimate(finding: Finding) -> Finding:
+    """Marked, for the mean may be moved by what it holds too, a bias or a rate, which wrong readings have taught it."""
+    return replace(finding, evidence=finding.evidence | {"by_estimate": True})
 
 
 def _turned(case: Case) -> Iterator[Finding]:

@@ -53,10 +53,19 @@ def _follows(finding: Finding, cause: Finding) -> bool:
         return True  # which moves the prediction
     if cause.code == "process_model" and _of_the_gyro(finding):
         return False
+    if "by_estimate" in finding.evidence and _of_readings(cause):
+        return True
+    if "by_estimate" in cause.evidence and _of_readings(finding):
+        return False
     if finding.tier <= cause.tier:
         return False
     anywhere = finding.code in SYMPTOMS or cause.code == "sensor_frozen"
     return anywhere or finding.sensor == cause.sensor or None in (finding.sensor, cause.sensor)
+
+
+def _of_readings(cause: Finding) -> bool:
+    """Whether a sensor is found wrong against the truth."""
+    return cause.sensor is not None and cause.evidence.get("against") == "truth"
 
 
 def _of_the_gyro(cause: Finding) -> bool:
