@@ -7,6 +7,8 @@ from dataclasses import replace
 from viz_estim.core.distributions import chi2
 from viz_estim.diagnosis.finding import SYMPTOMS, Finding, Severity
 
+_SENT = ("particles_far", "particles_collapsed")  # particles go where the readings and the motion send them
+
 
 def ranked(found: list[Finding]) -> list[Finding]:
     """What follows from another finding is a warning at most, so that the cause comes first.
@@ -47,8 +49,10 @@ def _follows(finding: Finding, cause: Finding) -> bool:
         # Errors of the state, from innovations of another size; and that these follow one another.
         size = cause.code in ("overconfident", "outliers") and "part" not in cause.evidence
         return size and ("part" in finding.evidence or finding.code == "coloured_innovation")
-    if finding.code in ("particles_far", "particles_collapsed") and cause.evidence.get("against") == "truth":
-        return True  # particles go where the readings and the motion send them
+    if finding.code in _SENT and cause.evidence.get("against") == "truth":
+        return True
+    if cause.code in _SENT and finding.evidence.get("against") == "truth":
+        return False
     if finding.code == "process_model" and _of_the_gyro(cause):
         return True  # which moves the prediction
     if cause.code == "process_model" and _of_the_gyro(finding):
