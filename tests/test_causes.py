@@ -201,8 +201,10 @@ def test_tuning_says_what_a_rerun_would() -> None:
 
 def test_particles_that_are_nowhere_near_the_readings_are_told() -> None:
     scenario = beacons.beacons_pf(beacons.beacons(None, np.random.default_rng(100)))
-    first = found(reads(lambda z: z / 0.3048)(scenario))[0]
-    assert (first.code, first.severity) == ("particles_far", "error")
+    first, *others = found(reads(lambda z: z / 0.3048)(scenario))
+    assert (first.code, first.severity) == ("units_or_axes", "error")
+    assert "feet for m" in first.cause
+    assert "particles_far" in {finding.code for finding in others}
 
 
 def log(time: Array, dt: Array | None = None, **inputs: Array) -> Run:

@@ -34,6 +34,14 @@ OTHER: dict[str, dict[str, Any]] = {
     "bias-by-median": {"duration": 5.0, "still": 3.0},
     "delay-of-50-ms": {"duration": 4.2},
     "one-index-off": {"duration": 2.5},
+    "exchanged-control": {"duration": 10.0},
+    "turned-map": {"duration": 15.0},
+    "antenna-beside": {"duration": 20.0},
+    "late-ranges": {"duration": 10.0},
+    "no-noise-in-s": {"duration": 10.0},
+    "inverse-attitude": {"duration": 2.5},
+    "real-part-last": {"duration": 2.5},
+    "camera-turned": {"duration": 3.0},
 }
 STEPS = {
     "arithmetic-quaternion-mean": 50,
@@ -45,7 +53,11 @@ STEPS = {
     "degrees-as-radians": 270,
     "g-as-mps2": 100,
     "gyro-freeze": 430,
+    "turns-in-the-world": 350,
     "delay-of-50-ms": 410,
+    "exchanged-beacons": 40,
+    "misplaced-beacon": 50,
+    "long-ranges": 40,
     "clamped-particles": 30,
     "noise-too-small-for-particles": 30,
 }

@@ -13,7 +13,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.run import run
 from viz_estim.core.spaces import Euclidean
 from viz_estim.diagnose import diagnose
-from viz_estim.diagnosis import confidence, evidence, gates, innovations, models
+from viz_estim.diagnosis import confidence, evidence, gates, innovations, models, motion, sensors
 from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
 from viz_estim.recording.memory import collect
 from viz_estim.recording.reader import Run
@@ -197,3 +197,32 @@ def test_a_normal_cloud_has_one_mode(N: int) -> None:
     plane = Euclidean(("x", "y"), "m")
     clouds = (np.random.default_rng(seed).standard_normal((N, 2)) for seed in range(200))
     assert all(len(modes(plane, cloud, np.full(N, -np.log(N)))) == 1 for cloud in clouds)
+
+
+def motions(factor: float, drift: float, rng: np.random.Generator) -> list[tuple[str, str]]:
+    """What is told of a motion of 1 m/s ± 0.5 that is predicted so, with noise of a tenth."""
+    told = 0.1 * (1 + 0.5 * rng.standard_normal(300))
+    truly = told / factor + 0.1 * drift + 0.01 * rng.standard_normal(300)
+    found = motion._moves_as("x", "m", np.arange(300), truly - told, told, np.full(300, 0.1), np.zeros(300), 6)
+    return severities(finding for _, finding in found)
+
+
+def test_a_motion_s_factor_and_drift_keep_to_the_budget() -> None:
+    rng = np.random.default_rng(7)
+    sound = [one for _ in range(1000) for one in motions(1.0, 0.0, rng)]
+    assert len(sound) <= 1000 * 0.05 / 30 + 3 * (1000 * 0.05 / 30) ** 0.5
+    as_large = [one for _ in range(100) for one in motions(1.05, 0.0, rng) + motions(1.0, 0.05, rng)]
+    assert {severity for _, severity in as_large} == {"warning"}
+    assert {severity for _ in range(20) for _, severity in motions(1.2, 0.0, rng)} == {"error"}
+    assert {severity for _ in range(20) for _, severity in motions(1.0, 0.3, rng)} == {"error"}
+
+
+@pytest.mark.parametrize(("share", "severity"), [(0.0, set()), (0.02, {"warning"}), (0.15, {"error"})])
+def test_a_clipped_sensor_is_an_error_where_more_than_a_fiftieth_is_lost(share: float, severity: set[str]) -> None:
+    rng, found = np.random.default_rng(8), []
+    for _ in range(30):
+        z = np.cumsum(rng.standard_normal((4000, 1)), axis=0)
+        given = {"z.range": np.minimum(z, np.quantile(z, 1 - share))}
+        of = replace(walk(), inputs=given, step=np.arange(4000), time=0.1 * np.arange(4000))
+        found += severities(sensors.saturated(of))
+    assert {one for _, one in found} == severity

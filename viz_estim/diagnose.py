@@ -25,6 +25,7 @@ from viz_estim.diagnosis import (
     signatures,
     stamps,
     truth,
+    updates,
 )  # fmt: skip
 from viz_estim.diagnosis.evidence import Case, case
 from viz_estim.diagnosis.finding import CODES, SYMPTOMS, Finding
@@ -54,6 +55,7 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     truth.sensors,
     errors.by_part,
     covariance.broken,
+    updates.updates,
     covariance.claims,
     covariance.bounds,
     covariance.unobservable,

@@ -1,4 +1,4 @@
-"""Particles against the truth: how the cloud's own moves carry it.
+"""Particles against the truth: how the cloud's own moves carry it; and means that have gone elsewhere.
 
 A particle filter records no model, but it has asked its model at many states: how each particle moved. So a planar
 robot's prediction from the truth is the mean of the particles' moves, each in its own body's frame, where it depends on
@@ -11,11 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
-from viz_estim.core.spaces import SE2, SO2
+from viz_estim.core.spaces import SE2, SO2, SO3
 from viz_estim.diagnosis.evidence import Case
 
 _FEWEST = 20
+WINDOW = 0.1  # s
 
 
 class Moves(NamedTuple):
@@ -49,6 +51,66 @@ def moves(case: Case) -> Moves | None:
         return None
     steps, truly_, told_ = zip(*kept, strict=True)
     return Moves(np.array(steps), np.array(truly_), np.array(told_))
+
+
+def moves_of_means(case: Case) -> Moves | None:
+    """The same of a filter whose one prediction moves the mean of a planar robot, wherever that has gone."""
+    run, at = case.run, _planar_part(case)
+    tables = [t for t in run.stages.values() if t.name.startswith("predict") and "mean" in t.values]
+    if at is None or len(tables) != 1 or run.properties.get("belief") == "Particles":
+        return None
+    (table,), pose = tables, SE2()
+    before, _ = case.sequence.before(table)
+    row = np.searchsorted(run.step, table.step)
+    told = pose.minus(table.mean[:, at], before[:, at])
+    truly = pose.minus(run.truth[row][:, at], run.truth[np.maximum(row - 1, 0)][:, at])
+    fine = np.isfinite(told).all(1) & np.isfinite(truly).all(1) & (row > 0) & (table.step > case.first)
+    return Moves(table.step[fine], truly[fine], told[fine]) if fine.sum() >= _FEWEST else None
+
+
+def turns_of_means(case: Case, window: float) -> tuple[str, Moves, Array] | None:
+    """The part that is an attitude, by window (s) what the truth turns by and the mean by its prediction, each in
+    its own body's axes (M, 3), and the mean's in the world's. In one step noise of the truth would hide it."""
+    run = case.run
+    tables = [t for t in run.stages.values() if t.name.startswith("predict") and "mean" in t.values]
+    parts = [(name, case.space.at[name]) for name, part in case.space.parts.items() if isinstance(part, SO3)]
+    if len(parts) != 1 or len(tables) != 1 or run.labels or "mean" not in run.ends:
+        return None
+    ((name, at), table), space = (parts[0], tables[0]), SO3()
+    before, _ = case.sequence.before(table)
+    row, usual = np.searchsorted(run.step, table.step), float(np.median(np.diff(run.time)))
+    n = max(1, round(window / max(usual, 1e-9)))
+    told = space.minus(table.mean[:, at], before[:, at])
+    fine = np.isfinite(told).all(1) & (row > 0) & (table.step > case.first)
+    rows = np.flatnonzero(fine)[: fine.sum() // n * n].reshape(-1, n)
+    rows = rows[row[rows[:, -1]] - row[rows[:, 0]] == n - 1]
+    turn = quaternions.exp(told)
+    about = quaternions.exp(quaternions.rotate(before[:, at], told))
+    whole, in_world = (_composed(q[rows]) for q in (turn, about))
+    truly = space.minus(run.truth[row[rows[:, -1]]][:, at], run.truth[row[rows[:, 0]] - 1][:, at])
+    known = np.isfinite(truly).all(1)
+    if known.sum() < _FEWEST:
+        return None
+    return name, Moves(table.step[rows[known, 0]], truly[known], whole[known]), in_world[known]
+
+
+def _composed(q: Array) -> Array:
+    """The rotation vectors (W, 3) of the products of n turns each (W, n, 4), one after the other."""
+    whole = q[:, 0]
+    for k in range(1, q.shape[1]):
+        whole = quaternions.multiply(whole, q[:, k])
+    return quaternions.log(whole)
+
+
+def _planar_part(case: Case) -> slice | None:
+    """Where x, y and a heading stand in the state, one after the other."""
+    names, parts = list(case.space.parts), list(case.space.parts.values())
+    for name, part, after in zip(names, parts, [*parts[1:], None], strict=True):
+        start = case.space.at[name].start
+        flat = not isinstance(part, SE2) and list(part.axis_units) == ["m", "m"] and isinstance(after, SO2)
+        if isinstance(part, SE2) or flat:
+            return slice(start, start + 3)
+    return None
 
 
 def _is_planar(case: Case) -> bool:

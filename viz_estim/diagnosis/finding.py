@@ -42,6 +42,7 @@ CODES = {
     "angle_wrap": "innovations near a full turn, quaternions off the sphere, or sign flips",
     "units_or_axes": "swapped axes, a sign or another unit would explain the readings",
     "process_model": "the prediction does not move the state as the truth moves: a factor, a sign or a drift",
+    "update": "an update does not do what its own numbers say: residual, S, gain, mean or covariance",
     "start": "the first belief is further from the truth than its covariance says",
     "jacobian": "a Jacobian is not the derivative of the model that it stands for",
     "noisy_prediction": "the prediction moves the mean at random: a sample of the noise was added to it",

@@ -17,7 +17,10 @@ class Against(NamedTuple):
     """A sensor's M readings against the truth: z (M, n), what the truth would give (M, n), r (M, m), R (M, m, m).
 
     foreseen (M, m) is the variance of the truth's reading by the filter's prediction, (H·P·Hᵀ)ᵢᵢ; slip (M,) bounds the
-    error of r by the linearisation, in standard deviations of R.
+    error of r by the model of the sensor, in standard deviations of R. part: which of the sensor's parts it is, if it
+    has several; exact: the model is the filter's own and no line along its Jacobian; attitude (M, d, d): the truth's,
+    world from body, if a part of the state says it; places (m, d), position (M, d): of distances, from where the model
+    takes them to be, and to where.
     """
 
     name: str
@@ -30,6 +33,25 @@ class Against(NamedTuple):
     noise: Array
     foreseen: Array
     slip: Array
+    part: str
+    exact: bool
+    attitude: Array | None
+    places: Array | None = None
+    position: Array | None = None
+
+    def pick(self, rows: slice | np.ndarray) -> Against:
+        """Some of the readings."""
+        return Against(*(v[rows] if isinstance(v, np.ndarray) else v for v in self))  # type: ignore[arg-type]
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} {self.part}" if self.part else self.name
+
+    def axis(self, i: int) -> str:
+        """A component as people call it: `gps x`, `pose attitude z`, `range 2`, `range/1`."""
+        axis = self.space.axes[i]
+        own = axis in ("", "angle", self.name.partition("/")[0])
+        return self.label if own else f"{self.label} {axis}"
 
 
 def white(one: Against, values: Array) -> Array:

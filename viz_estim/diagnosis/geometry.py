@@ -81,7 +81,7 @@ def quaternion_norms(case: Case) -> Iterator[Finding]:
 
 
 def units_or_axes(case: Case) -> Iterator[Finding]:
-    """Readings that a map M would bring to what was expected: the gain in log-likelihood, ½Σ(|ν|² − |M·z − ẑ|²) in S.
+    """Readings that a map M would bring to what was expected: the gain in log-likelihood, ½Σ(|ν|² − |z − M⁻¹·ẑ|²) in S.
 
     If the innovations are N(0, S), a gain above log(1/α) has at most the probability α, for any one map (Markov's
     inequality on a likelihood ratio; Ville 1939).
@@ -101,7 +101,7 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         z, predicted, precision = readings.z[sound], readings.predicted[sound], np.linalg.inv(readings.cov[sound])
         best, what = np.inf, ""
         for title, M in maps(len(space.axes), space.axis_units[0]):
-            off = z @ M.T - predicted
+            off = z - predicted @ np.linalg.inv(M).T
             value = float(np.einsum("ti,tij,tj->", off, precision, off))
             if value < best:
                 best, what = value, title

@@ -67,7 +67,7 @@ def biased(case: Case) -> Iterator[Finding]:
 
 def _own_share(readings: Readings, i: int) -> float:
     """The state's share of a component's variance, (H·P·Hᵀ/S)ᵢᵢ in the mean; 1 where R is not recorded."""
-    return float(np.mean(1 - readings.noise[:, i, i] / readings.cov[:, i, i]))
+    return max(float(np.mean(1 - readings.noise[:, i, i] / readings.cov[:, i, i])), 0.0)  # S may leave out R
 
 
 def coloured(case: Case) -> Iterator[Finding]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,13 +12,17 @@ from viz_estim.core.distributions import chi2, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, wrap
 from viz_estim.diagnosis import clouds
+from viz_estim.diagnosis.against import FEWEST
+from viz_estim.diagnosis.against import slip as bound
 from viz_estim.diagnosis.axes import maps
+from viz_estim.diagnosis.causes import named
 from viz_estim.diagnosis.evidence import Case, transitions
-from viz_estim.diagnosis.finding import Finding, judge
+from viz_estim.diagnosis.finding import GROSS, Finding, judge
 from viz_estim.diagnosis.fits import STRETCHES
-from viz_estim.diagnosis.truth import FEWEST, SURELY, named
-from viz_estim.diagnosis.truth import slip as bound
 
+SURELY = 0.95  # of the misfit explained: no error of a linearisation looks like that
+_SHEET = 0.05  # of a motion: what the data sheet of a wheel or a gyro leaves to a calibration
+_WORLD = "the world's axes"
 _ALIKE = 1.01  # of the squares that are left: as well explained
 
 
@@ -34,7 +39,17 @@ def prediction(case: Case) -> Iterator[Finding]:
         yield from _of_a_cloud(case, carried)
         return
     moves = [(table, F) for table in run.stages.values() if (F := transitions(case, table)) is not None]
-    if not np.isfinite(run.truth).any() or len(moves) != 1:
+    if not np.isfinite(run.truth).any():
+        return
+    if turned := list(_turned(case)):
+        yield from map(_by_estimate, turned)
+        return
+    moved = clouds.moves_of_means(case)
+    if moved is not None and (exchanged := _exchanged(moved.truly, moved.told, moved.step)) is not None:
+        yield _by_estimate(exchanged)
+        return
+    if len(moves) != 1:
+        yield from map(_by_estimate, _elsewhere(case))
         return
     (table, F), row = moves[0], {int(step): k for k, step in enumerate(run.step)}
     before, _ = case.sequence.before(table)
@@ -72,14 +87,45 @@ def prediction(case: Case) -> Iterator[Finding]:
             if (found := _turns_as(name, truly, told, moving[axes[0]][2])) is not None:
                 yield found
                 return
-    yield from _best(told_of)
+    yield from _best(told_of) if told_of else map(_by_estimate, _elsewhere(case))
+
+
+def _by_estimate(finding: Finding) -> Finding:
+    """Marked, for the mean may be moved by what it holds too, a bias or a rate, which wrong readings have taught it."""
+    return replace(finding, evidence=finding.evidence | {"by_estimate": True})
+
+
+def _turned(case: Case) -> Iterator[Finding]:
+    """An attitude that is turned by other axes or units, or about the world's axes: step by step, or by window."""
+    for window in (0.0, clouds.WINDOW):
+        if (found := clouds.turns_of_means(case, window)) is not None:
+            name, (of, truly, told), in_world = found
+            if (finding := _turns_as(name, truly, told, of, in_world)) is not None:
+                yield finding
+                return
+
+
+def _elsewhere(case: Case) -> Iterator[Finding]:
+    """The same in the body's axes, also of an estimate that has gone far from the truth."""
+    if (found := clouds.turns_of_means(case, clouds.WINDOW)) is not None:
+        name, (of, truly, told), _ = found
+        one, none = np.ones(len(of)), np.zeros(len(of))  # by window, which are all as long
+        told_of: list[tuple[float, Finding]] = []
+        for i, axis in enumerate("xyz"):
+            told_of += _moves_as(f"{name} {axis}", "rad", of, truly[:, i] - told[:, i], told[:, i], one, none, 6)
+        yield from _best(told_of)
+    if (moved := clouds.moves_of_means(case)) is not None:
+        yield from _of_a_cloud(case, moved)
 
 
 def _of_a_cloud(case: Case, carried: clouds.Moves) -> Iterator[Finding]:
-    """The same of particles, in the body's frame."""
+    """The same of a planar robot, in its body's frame."""
     dt = case.run.dt[np.searchsorted(case.run.step, carried.step)]
     rows = dt > 0
     if rows.sum() < FEWEST:
+        return
+    if (exchanged := _exchanged(carried.truly[rows], carried.told[rows], carried.step[rows])) is not None:
+        yield exchanged
         return
     none = np.zeros(int(rows.sum()))
     told_of: list[tuple[float, Finding]] = []
@@ -87,6 +133,23 @@ def _of_a_cloud(case: Case, carried: clouds.Moves) -> Iterator[Finding]:
         told, truly = carried.told[rows, i], carried.truly[rows, i]
         told_of += _moves_as(label, unit, carried.step[rows], truly - told, told, dt[rows], none, 6)
     yield from _best(told_of)
+
+
+def _exchanged(truly: Array, told: Array, of: np.ndarray) -> Finding | None:
+    """The way ahead predicted as the turn and the turn as the way ahead, by what is left of each (M, 3)."""
+    own = np.square(truly - told)[:, [0, 2]].sum(0)
+    left = np.square(truly - told[:, [2, 1, 0]])[:, [0, 2]].sum(0)
+    explained = float(np.mean(1 - left / np.maximum(own, 1e-300)))
+    gain = 0.5 * len(truly) * float(np.log(own / np.maximum(left, 1e-300)).sum())
+    if explained < SURELY or judge(float(np.exp(-min(gain, 700.0))), 1, large=True) != "error":
+        return None
+    return Finding(
+        "process_model", "error", None, (int(of[0]), int(of[-1])),
+        {"component": "control", "map": "exchanged", "explained": explained, "against": "truth"},
+        f"the prediction goes ahead by what the truth turns by, and turns by what it goes ahead ({explained:.0%} of "
+        "the difference): speed and turn rate are exchanged",
+        "check the order of the control's numbers",
+    )  # fmt: skip
 
 
 def _best(told_of: list[tuple[float, Finding]]) -> Iterator[Finding]:
@@ -97,13 +160,27 @@ def _best(told_of: list[tuple[float, Finding]]) -> Iterator[Finding]:
         yield replace(told_of[0][1], evidence=told_of[0][1].evidence | ({"also": also} if also else {}))
 
 
-def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray) -> Finding | None:
-    """The map of the rates' axes, or the unit, by which what is predicted (M, 3) is what happens (M, 3)."""
+def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Array | None = None) -> Finding | None:
+    """The map of the rates' axes, or the unit, by which what is predicted (M, 3) is what happens (M, 3); or that it is
+    predicted in the world's axes (M, 3)."""
     own = float(np.square(truly - told).sum())
-    best, what = min((float(np.square(truly - told @ A.T).sum()), title) for title, A in maps(3, "rad/s"))
+    # In what was predicted, whose size stays as it is: a unit that makes it small explains nothing by that.
+    tried = [(float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title) for title, A in maps(3, "rad/s")]
+    if in_world is not None:
+        tried.append((float(np.square(truly - in_world).sum()), _WORLD))
+    best, what = min(tried)
     gain, explained = 0.5 * truly.size * np.log(own / max(best, 1e-300)), 1 - best / max(own, 1e-300)
-    if explained < SURELY or judge(float(np.exp(-min(gain, 700.0))), 60, large=True) != "error":
+    least = SURELY if in_world is None else 1 - 1 / GROSS
+    if explained < least or judge(float(np.exp(-min(gain, 700.0))), 60, large=True) != "error":
         return None
+    if what == _WORLD:
+        return Finding(
+            "process_model", "error", None, (int(of[0]), int(of[-1])),
+            {"component": name, "map": what, "explained": explained, "against": "truth"},
+            f"{name} is predicted to turn about the world's axes by what the body turns by about its own: this "
+            f"explains {explained:.0%} of the difference",
+            "multiply by a turn of the body's rates from the right, q·Exp(ω·dt), where q is world from body",
+        )  # fmt: skip
     words = f"its rates as {what}" if what.startswith("axes") else f"a factor ({what})"
     return Finding(
         "process_model", "error", None, (int(of[0]), int(of[-1])),
@@ -116,16 +193,16 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray) -> Finding |
 def _moves_as(
     label: str, unit: str, of: np.ndarray, w: Array, told: Array, dt: Array, slip: Array, tests: int
 ) -> Iterator[tuple[float, Finding]]:
-    """w = (c − 1)·Δ' + b·dt: which of the two is off, if any. By rates, so that a long step counts like others.
+    """w = (c − 1)·Δ' + b·dt: which of the two is off, if any. By rates, so that a long step counts like others. Large
+    is what is more than 5 % of the motion off, for sure.
 
     Noise of the control pulls the slope of Δ on Δ' to zero, noise of the motion that of Δ' on Δ: the factor lies
     between the two, and where 1 does too there is none.
     """
     w, told, slip = w / dt, told / dt, slip / dt
     one, truly = np.ones_like(told), told + w
-    drift, p_drift, left_drift = _slope(w, one)
-    beta, p_factor, left_factor = _slope(w, told)
-    back, p_back, _ = _slope(-w, truly)
+    steady, forth, aback = _slope(w, one), _slope(w, told), _slope(-w, truly)
+    drift, beta, back, left_drift, left_factor = steady.value, forth.value, aback.value, steady.left, forth.left
     ends = 1 / (1 + beta) if beta != -1 else np.inf, 1 + back
     by_factor = left_factor < left_drift
     share = 1 - min(left_factor, left_drift) / max(float((w**2).sum()), 1e-300)
@@ -139,8 +216,8 @@ def _moves_as(
         # Of what is predicted, against what happens: the end that has a name, or the more careful one.
         known = [f for f in ends if named(f, unit) != named(1.3, unit)]
         factor = known[0] if known else min(ends, key=lambda f: abs(f - 1))
-        p = max(p_factor, p_back)
-        severity = judge(p, tests, large=abs(factor - 1) > 0.05)
+        p = max(forth.p_beyond(0.0), aback.p_beyond(0.0))
+        severity = judge(p, tests, large=max(forth.p_beyond(_SHEET), aback.p_beyond(_SHEET)))
         sign = (
             "its sign is wrong"
             if abs(factor + 1) < 0.2
@@ -156,7 +233,8 @@ def _moves_as(
         )
         evidence: dict[str, object] = {"component": label, "factor": factor, "p": p}
     else:
-        severity = judge(p_drift, tests, large=abs(drift) > 0.05 * float(np.abs(told).mean()))
+        p_drift = steady.p_beyond(0.0)
+        severity = judge(p_drift, tests, large=steady.p_beyond(_SHEET * float(np.abs(told).mean())))
         rate = f"{unit}²" if unit.endswith("/s") else f"{unit}/s"
         cause = (
             f"the prediction misses a steady {drift:+.3g} {rate} of {label}: the control that moves it has a bias, "
@@ -170,16 +248,29 @@ def _moves_as(
         yield share, Finding("process_model", severity, None, steps, evidence | {"against": "truth"}, cause, remedy)
 
 
-def _slope(y: Array, x: Array) -> tuple[float, float, float]:
-    """The slope of y on x (M,) through zero, its p by a t-test, and Σ of the squares that are left."""
+class Slope(NamedTuple):
+    """A slope through zero, its standard error and degrees of freedom, and Σ of the squares that are left."""
+
+    value: float
+    error: float
+    dof: float
+    left: float
+
+    def p_beyond(self, size: float) -> float:
+        """The chance of such a slope where it is of this size."""
+        return float(2 * t.sf(max(abs(self.value) - size, 0.0) / max(self.error, 1e-300), self.dof))
+
+
+def _slope(y: Array, x: Array) -> Slope:
+    """Of y on x (M,), with a standard error by 20 stretches of the run where that is larger."""
     A = float(x @ x)
     if A <= 0:
-        return 0.0, 1.0, float(y @ y)
+        return Slope(0.0, 1.0, 1.0, float(y @ y))
     slope = float(x @ y) / A
     left = y - slope * x
     pieces = np.array([part.sum() for part in np.array_split(x * left, min(STRETCHES, len(y) // 5))])
     B = len(pieces)
     scatter, model = float(pieces @ pieces) * B / (B - 1) / A**2, float(left @ left) / len(y) / A
     if scatter < model * chi2.isf(0.01, B - 1) / (B - 1):
-        return slope, float(2 * t.sf(abs(slope) / np.sqrt(max(model, 1e-300)), len(y) - 1)), float(left @ left)
-    return slope, float(2 * t.sf(abs(slope) / np.sqrt(scatter), B - 1)), float(left @ left)
+        return Slope(slope, float(np.sqrt(model)), len(y) - 1, float(left @ left))
+    return Slope(slope, float(np.sqrt(scatter)), B - 1, float(left @ left))

@@ -7,6 +7,8 @@ from dataclasses import replace
 from viz_estim.core.distributions import chi2
 from viz_estim.diagnosis.finding import SYMPTOMS, Finding, Severity
 
+_SENT = ("particles_far", "particles_collapsed")  # particles go where the readings and the motion send them
+
 
 def ranked(found: list[Finding]) -> list[Finding]:
     """What follows from another finding is a warning at most, so that the cause comes first.
@@ -47,10 +49,33 @@ def _follows(finding: Finding, cause: Finding) -> bool:
         # Errors of the state, from innovations of another size; and that these follow one another.
         size = cause.code in ("overconfident", "outliers") and "part" not in cause.evidence
         return size and ("part" in finding.evidence or finding.code == "coloured_innovation")
+    if finding.code in _SENT and cause.evidence.get("against") == "truth":
+        return True
+    if cause.code in _SENT and finding.evidence.get("against") == "truth":
+        return False
+    if finding.code == "process_model" and _of_the_gyro(cause):
+        return True  # which moves the prediction
+    if cause.code == "process_model" and _of_the_gyro(finding):
+        return False
+    if "by_estimate" in finding.evidence and _of_readings(cause):
+        return True
+    if "by_estimate" in cause.evidence and _of_readings(finding):
+        return False
     if finding.tier <= cause.tier:
         return False
     anywhere = finding.code in SYMPTOMS or cause.code == "sensor_frozen"
     return anywhere or finding.sensor == cause.sensor or None in (finding.sensor, cause.sensor)
+
+
+def _of_readings(cause: Finding) -> bool:
+    """Whether a sensor is found wrong against the truth."""
+    return cause.sensor is not None and cause.evidence.get("against") == "truth"
+
+
+def _of_the_gyro(cause: Finding) -> bool:
+    """Whether a gyro is found wrong by itself, at rest or against gravity, whatever the filter makes of it."""
+    alone = "at_rest" in cause.evidence or cause.code == "units_or_axes"
+    return cause.sensor == "gyro" and alone and "against" not in cause.evidence
 
 
 def _softened(finding: Finding, cause: Finding | None) -> Finding:

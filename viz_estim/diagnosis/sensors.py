@@ -15,6 +15,7 @@ from viz_estim.scenarios.imu_health import GRAVITY, frozen_accel, frozen_gyro, s
 
 _SLOWER = 3.0  # a pause of so many usual intervals is one in which readings are missing
 _AT_THE_END = 0.75  # of a smooth signal's extreme and next value: an arc sine has 0.71 at its extreme
+_CLIPPED = 0.02  # of the readings: a normal signal that is clipped there loses as much of its variance in one tail
 _RESTING = 0.05  # rad/s: more than that is no bias that was left over
 
 
@@ -162,7 +163,8 @@ def saturated(run: Run, without: Sequence[tuple[int, int]] = ()) -> Iterator[Fin
     """Readings that pile up at a component's largest or smallest value: more of them than at the next value inside.
 
     without: intervals of steps (first, last) to leave out. Binomial: of the readings at the extreme and within one
-    quantum of it, a smooth signal has at most 3 of 4 there.
+    quantum of it, a smooth signal has at most 3 of 4 there. Large is more than 2 % of all readings for sure, by a
+    binomial test too.
     """
     sensors = {name: _left_of(run, one, without) for name, one in given(run).items()}
     tests = 2 * sum(values.shape[1] for _, values in sensors.values())
@@ -178,7 +180,7 @@ def saturated(run: Run, without: Sequence[tuple[int, int]] = ()) -> Iterator[Fin
                 count, around = int(top.sum()), int(near.sum()) + 1
                 moving = (np.diff(x, prepend=np.nan) != 0) | (np.diff(x, append=np.nan) != 0)
                 p = float(binom.sf(count - 1, around, _AT_THE_END))
-                severity = judge(p, tests, large=count > 0.02 * len(x))
+                severity = judge(p, tests, large=float(binom.sf(count - 1, len(x), _CLIPPED)))
                 if severity and count >= 10 and moving[top].any():
                     at = rows[np.flatnonzero(top)]
                     steps = int(run.step[at[0]]), int(run.step[at[-1]])
@@ -226,7 +228,7 @@ def biased_at_rest(run: Run) -> Iterator[Finding]:
     if severity:
         value, axis = float(rest.mean(0)[worst]), "xyz"[worst]
         steps = int(run.step[both.rows[0]]), int(run.step[both.rows[still - 1]])
-        evidence = {"component": axis, "bias": value, "z": float(score[worst]), "p": p}
+        evidence = {"component": axis, "bias": value, "z": float(score[worst]), "p": p, "at_rest": True}
         yield Finding(
             "biased_innovation", severity, "gyro", steps, evidence,
             f"lying still, the gyro's {axis} reads {value:+.2g} rad/s ({np.degrees(value) * 30:+.1f}° in 30 s): its "

@@ -13,7 +13,9 @@ from viz_estim.recording.reader import Run
 
 _ROUNDING = 1e-9  # s: to what stamps are kept
 _MISSING = 1.5  # usual intervals: what is longer is nearer to two than to one, so that a sample is missing
-_LARGE = 0.05  # of the time that dt gets wrong, or of the interval that stamps jitter by
+# Of the time that dt gets wrong, or of the interval that stamps jitter by: Q, which goes as dt, is as wrong. There is
+# no chance in either: a filter's dt is the stamps' difference or it is not, and jitter is a note.
+_LARGE = 0.05
 
 
 def stamps(run: Run) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from viz_estim.core.spaces import Euclidean, Product
 from viz_estim.scenarios import beacons, diffdrive, flawed_data, flawed_filters, imu, landmarks, plaza, quadrotor, scan
 from viz_estim.scenarios.beacons import BeaconData
 from viz_estim.scenarios.diffdrive import DriveData
+from viz_estim.scenarios.flawed_entries import FLAWED, broken, flaw
 from viz_estim.scenarios.imu_data import ImuData
 from viz_estim.scenarios.landmarks import LandmarksData
 from viz_estim.scenarios.plaza_data import PlazaData
@@ -26,167 +27,136 @@ from viz_estim.scenarios.quadrotor_model import Model
 from viz_estim.scenarios.scan_files import ScanData
 
 
-class Flaw(NamedTuple):
-    """A broken scenario, the code by which it is found, and the module of the healthy system that it wraps."""
-
-    scenario: Callable[..., Scenario]
-    code: str
-    system: Any
-
-    @property
-    def data(self) -> Callable[..., Any]:
-        """The data function of the healthy system."""
-        return getattr(self.system, self.system.__name__.rpartition(".")[2])
-
-
-FLAWED: dict[str, Flaw] = {}
-_Maker = Callable[..., Scenario]
-
-
-def _flaw(code: str, system: Any) -> Callable[[_Maker], _Maker]:
-    """Enters a scenario into the gallery under its name, with hyphens."""
-
-    def enter(make: _Maker) -> _Maker:
-        FLAWED[make.__name__.replace("_", "-")] = Flaw(make, code, system)
-        return make
-
-    return enter
-
-
-def _broken(scenario: Scenario, change: Callable[[Any], Any]) -> Scenario:
-    return replace(scenario, estimator=change(scenario.estimator))
-
-
-@_flaw("noisy_prediction", landmarks)
+@flaw("noisy_prediction", landmarks)
 def noise_in_prediction(data: LandmarksData) -> Scenario:
     """A sample of the process noise is added to the predicted mean."""
-    return _broken(landmarks.landmarks_ekf(data), flawed_filters.Sampling)
+    return broken(landmarks.landmarks_ekf(data), flawed_filters.Sampling)
 
 
-@_flaw("jacobian", landmarks)
+@flaw("jacobian", landmarks)
 def transposed_jacobian(data: LandmarksData) -> Scenario:
     """The measurement's Jacobian has rows and columns swapped."""
     change = flawed_filters.transposed_block
-    return _broken(landmarks.landmarks_ekf(data), lambda f: flawed_filters.with_sensors(f, change))
+    return broken(landmarks.landmarks_ekf(data), lambda f: flawed_filters.with_sensors(f, change))
 
 
-@_flaw("overconfident", landmarks)
+@flaw("overconfident", landmarks)
 def noise_too_small(data: LandmarksData) -> Scenario:
     """R is ten times too small."""
     change: Callable[[Sensor], Sensor] = lambda sensor: replace(sensor, noise=0.1 * sensor.noise)  # noqa: E731
-    return _broken(landmarks.landmarks_ekf(data), lambda f: flawed_filters.with_sensors(f, change))
+    return broken(landmarks.landmarks_ekf(data), lambda f: flawed_filters.with_sensors(f, change))
 
 
-@_flaw("underconfident", landmarks)
+@flaw("underconfident", landmarks)
 def noise_too_large(data: LandmarksData) -> Scenario:
     """R is ten times too large."""
     change: Callable[[Sensor], Sensor] = lambda sensor: replace(sensor, noise=10 * sensor.noise)  # noqa: E731
-    return _broken(landmarks.landmarks_ekf(data), lambda f: flawed_filters.with_sensors(f, change))
+    return broken(landmarks.landmarks_ekf(data), lambda f: flawed_filters.with_sensors(f, change))
 
 
-@_flaw("overconfident", landmarks)
+@flaw("overconfident", landmarks)
 def process_noise_too_small(data: LandmarksData) -> Scenario:
     """Q is ten thousand times too small: the filter takes the point to go straight on."""
-    return _broken(landmarks.landmarks_ekf(data), lambda f: flawed_filters.with_process_noise(f, 1e-4))
+    return broken(landmarks.landmarks_ekf(data), lambda f: flawed_filters.with_process_noise(f, 1e-4))
 
 
-@_flaw("used_twice", landmarks)
+@flaw("used_twice", landmarks)
 def updates_twice(data: LandmarksData) -> Scenario:
     """Every reading is taken in twice."""
-    return _broken(landmarks.landmarks_ekf(data), flawed_filters.Repeating)
+    return broken(landmarks.landmarks_ekf(data), flawed_filters.Repeating)
 
 
-@_flaw("used_twice", landmarks)
+@flaw("used_twice", landmarks)
 def holds_readings(data: LandmarksData) -> Scenario:
     """A sensor at half the rate: its last reading is given again in between."""
     return flawed_data.held(landmarks.landmarks_ekf(data))
 
 
-@_flaw("outliers", landmarks)
+@flaw("outliers", landmarks)
 def glitches(data: LandmarksData) -> Scenario:
     """Three of a hundred readings are metres off, and there is no gate."""
     return flawed_data.with_glitches(landmarks.landmarks_ekf(data), 0.03, 4.0)
 
 
-@_flaw("gate", landmarks)
+@flaw("gate", landmarks)
 def narrow_gate(data: LandmarksData) -> Scenario:
     """The gate is so narrow that it refuses most readings."""
     return landmarks.landmarks_ekf(data, gate=0.3)
 
 
-@_flaw("sensor_silent", landmarks)
+@flaw("sensor_silent", landmarks)
 def silence(data: LandmarksData) -> Scenario:
     """The sensor gives nothing for a tenth of the run."""
     return flawed_data.silenced(landmarks.landmarks_ekf(data), 0.5, 0.6)
 
 
-@_flaw("sensor_saturated", landmarks)
+@flaw("sensor_saturated", landmarks)
 def clipped_ranges(data: LandmarksData) -> Scenario:
     """The sensor's range ends below what it should read."""
     return flawed_data.clipped(landmarks.landmarks_ekf(data), 0.15)
 
 
-@_flaw("stamps", landmarks)
+@flaw("stamps", landmarks)
 def fixed_dt(data: LandmarksData) -> Scenario:
     """Every fourth sample is lost, and the filter takes one dt for all."""
     return flawed_data.with_fixed_dt(landmarks.landmarks_ekf(data))
 
 
-@_flaw("diverged", landmarks)
+@flaw("diverged", landmarks)
 def mirrored_start(data: LandmarksData) -> Scenario:
     """The filter starts on the wrong side of the landmarks, where the ranges are the same."""
     return landmarks.landmarks_ekf(data, side="right")
 
 
-@_flaw("covariance", landmarks)
+@flaw("covariance", landmarks)
 def forgotten_transpose(data: LandmarksData) -> Scenario:
     """The covariance is predicted as F·P + Q."""
-    return _broken(landmarks.landmarks_ekf(data), flawed_filters.Untransposed)
+    return broken(landmarks.landmarks_ekf(data), flawed_filters.Untransposed)
 
 
-@_flaw("covariance", landmarks)
+@flaw("covariance", landmarks)
 def subtracts_too_much(data: LandmarksData) -> Scenario:
     """The update takes three times from the covariance what a reading tells."""
-    return _broken(landmarks.landmarks_ekf(data), flawed_filters.Greedy)
+    return broken(landmarks.landmarks_ekf(data), flawed_filters.Greedy)
 
 
-@_flaw("units_or_axes", imu)
+@flaw("units_or_axes", imu)
 def unflipped_axes(data: ImuData) -> Scenario:
     """The signs of the accelerometer's x and y are not turned."""
     return imu.imu_ukf(replace(data, accel=data.accel * [-1.0, -1.0, 1.0]))
 
 
-@_flaw("units_or_axes", imu)
+@flaw("units_or_axes", imu)
 def gyro_rows_as_xyz(data: ImuData) -> Scenario:
     """The file's gyro rows z, x, y are taken for x, y, z."""
     return imu.imu_ukf(replace(data, gyro=data.gyro[:, [2, 0, 1]]))
 
 
-@_flaw("units_or_axes", imu)
+@flaw("units_or_axes", imu)
 def degrees_as_radians(data: ImuData) -> Scenario:
     """The gyro's rates are in degrees, the filter takes them for radians."""
     return imu.imu_ukf_gyro(replace(data, gyro=np.degrees(data.gyro)))
 
 
-@_flaw("units_or_axes", imu)
+@flaw("units_or_axes", imu)
 def g_as_mps2(data: ImuData) -> Scenario:
     """The accelerometer reads in g, the filter expects m/s²."""
     return imu.imu_ukf(replace(data, accel=data.accel / 9.81))
 
 
-@_flaw("biased_innovation", imu)
+@flaw("biased_innovation", imu)
 def bias_by_median(data: ImuData) -> Scenario:
     """The gyro's bias is the median of whole counts, not their mean."""
     return imu.imu_ukf(flawed_data.by_median(data))
 
 
-@_flaw("sensor_frozen", imu)
+@flaw("sensor_frozen", imu)
 def gyro_freeze(data: ImuData) -> Scenario:
     """The gyro sticks for a second and a half, and the filter believes it."""
     return imu.imu_ukf(flawed_data.frozen(data))
 
 
-@_flaw("angle_wrap", imu)
+@flaw("angle_wrap", imu)
 def arithmetic_quaternion_mean(data: ImuData) -> Scenario:
     """The sigma points' attitudes are averaged as four plain numbers."""
     healthy = imu.imu_ukf(data)
@@ -194,13 +164,13 @@ def arithmetic_quaternion_mean(data: ImuData) -> Scenario:
     return replace(healthy, beliefs={k: flawed_filters.in_space(b, mean) for k, b in healthy.beliefs.items()})
 
 
-@_flaw("unobservable_update", imu)
+@flaw("unobservable_update", imu)
 def heading_by_gravity(data: ImuData) -> Scenario:
     """The model of the accelerometer leans to a level axis of the world, and so reads a heading from gravity."""
-    return _broken(imu.imu_ukf(data), flawed_filters.seeing_heading)
+    return broken(imu.imu_ukf(data), flawed_filters.seeing_heading)
 
 
-@_flaw("unobservable_update", imu)
+@flaw("unobservable_update", imu)
 def covariance_left_behind(data: ImuData) -> Scenario:
     """The covariance is not carried to the new mean, so that the heading's uncertainty leaks away."""
     healthy = imu.imu_ukf_gyro(data, initial_attitude_std=0.3)
@@ -208,26 +178,26 @@ def covariance_left_behind(data: ImuData) -> Scenario:
     return replace(healthy, beliefs={k: flawed_filters.in_space(b, space) for k, b in healthy.beliefs.items()})
 
 
-@_flaw("lag", imu)
+@flaw("lag", imu)
 def delay_of_50_ms(data: ImuData) -> Scenario:
     """The accelerometer's readings come 50 ms late."""
     late = np.searchsorted(data.time, data.time - 0.05)
     return imu.imu_ukf(replace(data, accel=data.accel[late]))
 
 
-@_flaw("lag", quadrotor)
+@flaw("lag", quadrotor)
 def one_index_off(data: QuadrotorData) -> Scenario:
     """The camera's pose k is taken for pose k + 1: an index counted from 1 in place of 0."""
     return flawed_data.shifted(quadrotor.quadrotor_ukf_pose(data), 1)
 
 
-@_flaw("lag", diffdrive)
+@flaw("lag", diffdrive)
 def gps_one_late(data: DriveData) -> Scenario:
     """Each position is taken for that of the next one's moment: an index that is one off."""
     return flawed_data.shifted(diffdrive.diffdrive_ekf(data), 1)
 
 
-@_flaw("angle_wrap", quadrotor)
+@flaw("angle_wrap", quadrotor)
 def angles_not_wrapped(data: QuadrotorData) -> Scenario:
     """The difference of two headings is not wrapped, and the flight looks back over the half turn."""
     headings = np.unwrap(Model("zxy").of(data.pose[np.isfinite(data.pose).all(1)])[:, 5])
@@ -238,29 +208,29 @@ def angles_not_wrapped(data: QuadrotorData) -> Scenario:
         space = Product(position=Euclidean(("x", "y", "z"), "m"), attitude=Euclidean(("roll", "pitch", "yaw"), "rad"))
         return replace(filter, sensors={k: replace(s, space=space) for k, s in filter.sensors.items()})
 
-    return _broken(healthy, plain)
+    return broken(healthy, plain)
 
 
-@_flaw("biased_innovation", plaza)
+@flaw("biased_innovation", plaza)
 def no_bias_state(data: PlazaData) -> Scenario:
     """The ranges are too long, and nothing in the state says so."""
     return plaza.range_ekf(data, range_bias="none", gate=None)
 
 
-@_flaw("particles_clamped", beacons)
+@flaw("particles_clamped", beacons)
 def clamped_particles(data: BeaconData) -> Scenario:
     """Particles that leave the area are put back on its edge."""
     low, high = np.array([0.0, 0.0, -np.inf]), np.array([*beacons.BEACONS[1] - [3.0, 0.0], np.inf])
-    return _broken(beacons.beacons_pf(data), lambda f: flawed_filters.Clamping(f, low, high))
+    return broken(beacons.beacons_pf(data), lambda f: flawed_filters.Clamping(f, low, high))
 
 
-@_flaw("particles_collapsed", beacons)
+@flaw("particles_collapsed", beacons)
 def noise_too_small_for_particles(data: BeaconData) -> Scenario:
     """The true noises, and 300 particles all over the area: hardly one of them is where the readings are."""
     return beacons.beacons_pf(data, particles=300, range_noise=0.1, speed_noise=0.105, turn_noise=0.09)
 
 
-@_flaw("process_model", beacons)
+@flaw("process_model", beacons)
 def turns_the_wrong_way(data: BeaconData) -> Scenario:
     """The sign of the turn rate that drives the particles is wrong."""
     healthy = beacons.beacons_pf(data)
@@ -268,13 +238,19 @@ def turns_the_wrong_way(data: BeaconData) -> Scenario:
     return replace(healthy, ticks=ticks)
 
 
-@_flaw("icp_few_matches", scan)
+@flaw("icp_few_matches", scan)
 def max_distance_too_small(data: ScanData) -> Scenario:
     """Points further apart than a five centimetres are no match, and the clouds are."""
     return scan.scan_icp(data, max_distance=0.05)
 
 
-@_flaw("icp_not_converged", scan)
+@flaw("icp_not_converged", scan)
 def stopped_early(data: ScanData) -> Scenario:
     """Three iterations, settled or not."""
     return scan.scan_icp(data, iterations=3)
+
+
+# The others enter themselves.
+from viz_estim.scenarios import flawed_readings, flawed_updates  # noqa: E402, F401
+
+__all__ = ["FLAWED"]
