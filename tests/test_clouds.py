@@ -1,13 +1,15 @@
 """Particles against the truth: what they are moved by is told from the recording, wherever the cloud has gone."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from viz_estim import load, record
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario, run
-from viz_estim.core.spaces import SE2
+from viz_estim.core.spaces import SE2, Euclidean, Product
 from viz_estim.diagnose import diagnose
 from viz_estim.diagnosis import clouds, evidence, motion
 from viz_estim.recording.memory import collect
@@ -70,3 +72,35 @@ def test_readings_that_pull_a_well_moved_cloud_away_are_said_to() -> None:
     found = diagnose(collect(scenario, run(replace(scenario, ticks=ticks), 1)))
     told = next(finding for finding in found if finding.code == "overconfident")
     assert "the readings pull the cloud away" in told.cause
+
+
+def kept(states: list[Array], tmp_path: Path) -> list[str]:
+    """The codes that a person's own particle filter raises: by turns a prediction's states and a resampling's."""
+    with record(tmp_path / "own.rrd", Product(place=Euclidean(("x", "y"), "m"))) as rec:
+        for k, cloud in enumerate(states):
+            rec.stage("predict" if k % 2 else "resample", states=cloud)
+            rec.step(time=0.1 * k)
+    return [finding.code for finding in diagnose(load(tmp_path / "own.rrd"))]
+
+
+def test_copies_that_part_in_one_direction_alone_are_held_nowhere(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    states = []
+    cloud = rng.standard_normal((300, 2))
+    for _ in range(20):
+        cloud = cloud[np.sort(rng.integers(0, 300, 300))]  # many copies of the outermost too
+        states.append(cloud)
+        cloud = cloud + np.stack([np.full(300, 0.1), rng.standard_normal(300)], axis=1)  # noise along y alone
+        states.append(cloud)
+    assert "particles_clamped" not in kept(states, tmp_path)
+
+
+def test_particles_held_at_a_wall_are_told(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    states = []
+    cloud = rng.standard_normal((300, 2))
+    for _ in range(20):
+        states.append(cloud + 0)
+        cloud = np.minimum(cloud + rng.standard_normal((300, 2)), 1.5)
+        states.append(cloud)
+    assert "particles_clamped" in kept(states, tmp_path)

@@ -23,6 +23,7 @@ from filterpy.kalman import (  # type: ignore[import-untyped]
 import viz_estim
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, Euclidean, Product
+from viz_estim.diagnose import diagnose
 
 F = np.array([[1.0, 0.1], [0.0, 1.0]])
 Names = dict[str, str]
@@ -673,3 +674,17 @@ def test_stone_soup_s_other_filters_are_watched(kind: str, tmp_path: Path) -> No
         assert run.summary()["nis"]["z"]["dof"] == 2
     else:
         assert run.inputs["z.z"].shape == (9, 2)
+
+
+@pytest.mark.parametrize("where", ["mean", "cov"])
+def test_a_loop_that_goes_on_with_nan_is_no_healthy_one(where: str, tmp_path: Path) -> None:
+    with viz_estim.record(tmp_path / "a.rrd", STATE) as rec:
+        for k in range(20):
+            mean, cov = np.zeros(2), np.eye(2)
+            if k >= 12:
+                {"mean": mean, "cov": cov}[where][:] = np.nan
+            rec.stage("predict", mean=mean, cov=cov)
+            rec.step(time=0.1 * k)
+    first = diagnose(viz_estim.load(tmp_path / "a.rrd"))[0]
+    assert (first.code, first.severity, first.steps) == ("failed", "error", (12, 19))
+    assert "after predict" in first.cause

@@ -1,5 +1,6 @@
 """Scans: the real clouds' figures, files of every kind, the simulation's truth, and one line for bad input."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -396,3 +397,10 @@ def test_the_own_files_are_what_simulate_writes_and_run(cli: Cli, tmp_path: Path
     _, figures = steps_of(scan([OWN], RNG))
     assert (figures["iterations"], figures["matches"], figures["converged"]) == (17, 1361, 1)
     assert figures["registration_rmse"] == pytest.approx(0.07577, abs=1e-5)
+
+
+def test_matches_that_were_not_kept_are_no_lack_of_them(cli: Cli, tmp_path: Path) -> None:
+    options = ["--seed", 1, "--set", "data.points=300", "--every", 7]
+    strict(cli("run", "scan-icp", *options, "--out", tmp_path / "a.rrd", "--json"))
+    codes = {finding["code"] for finding in json.loads(cli("diagnose", tmp_path / "a.rrd", "--json").out)["findings"]}
+    assert "icp_few_matches" not in codes

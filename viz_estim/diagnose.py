@@ -169,7 +169,7 @@ def _without_a_wrong_gyro_s(run: Run, found: list[Finding]) -> list[Finding]:
 
 def _failure(run: Run) -> list[Finding]:
     if run.error is None:
-        return []
+        return _no_number(run)
     step = int(run.step[-1])
     return [
         Finding(
@@ -180,6 +180,31 @@ def _failure(run: Run) -> list[Finding]:
             {"message": run.error},
             f"the filter raised at {run.error}",
             f"`viz-estim debug FILE` opens at step {step}, with the stages that came before the failure",
+        )
+    ]
+
+
+def _no_number(run: Run) -> list[Finding]:
+    """A belief that was recorded as NaN or infinity, by a loop that went on nevertheless."""
+    if run.labels or "particles" in run.properties:
+        return []
+    lost = np.flatnonzero(~(np.isfinite(run.mean).all(1) & np.isfinite(run.cov).all((1, 2))))
+    if not len(lost):
+        return []
+    step, last = int(run.step[lost[0]]), int(run.step[lost[-1]])
+    stage = next(
+        table.name for table, row in run.at(step) if not np.isfinite([*table.mean[row], *table.cov[row].flat]).all()
+    )
+    return [
+        Finding(
+            "failed",
+            "error",
+            None,
+            (step, last),
+            {"stage": stage, "steps": len(lost)},
+            f"from step {step} on, after {stage}, the belief is no number (NaN or infinity)",
+            f"go to step {step}: what the stages before it hold tells what was divided by zero, overflowed, or had no "
+            "Cholesky factor",
         )
     ]
 

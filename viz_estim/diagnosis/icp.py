@@ -83,7 +83,10 @@ def few_matches(case: Case) -> Iterator[Finding]:
     matched = next((t for t in case.run.stages.values() if "matches.distance" in t.values), None)
     if matched is None or not len(matched.step):
         return
-    count, N = len(matched.values["matches.distance"][-1]), _points(case)
+    fits, N = _fits(case), _points(case)
+    ends = fits is not None and "count" in fits.values and len(fits.step) and case.run.error is None
+    # The fit's own count is kept where the matches are thinned; one that failed has none.
+    count = int(fits.values["count"].ravel()[-1]) if fits and ends else len(matched.values["matches.distance"][-1])
     severity = judge(float(binom.cdf(count, N, _HALF)), 1, large=count < 0.5 * _HALF * N)
     if severity or count < 3:
         steps = int(matched.step[0]), int(matched.step[-1])

@@ -13,6 +13,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import Finding, level
+from viz_estim.recording.tables import StageTable
 
 _LOOKED_AT = 200  # steps at most, at which modes are looked for
 
@@ -65,7 +66,8 @@ def _count(case: Case) -> int:
 
 
 def clamped(case: Case) -> Iterator[Finding]:
-    """Particles that are held at a bound: several share one extreme number that are no copies of one another.
+    """Particles that are held at a bound: a prediction gave several one extreme number that were at several places, and
+    are no copies of one another.
 
     Of N draws of a continuous number two are equal with N²·ε at most (a birthday among 1/ε values), so that three that
     are is no chance. An error where the share that is held is beyond 1/√N: an edge lies a standard deviation σ or more
@@ -77,11 +79,17 @@ def clamped(case: Case) -> Iterator[Finding]:
         if not table.name.startswith("predict") or "states" not in table.values:
             continue
         for row, cloud in enumerate(table.values["states"]):
-            if not np.isfinite(cloud).all():
+            before = _before(case, table, row)
+            if not np.isfinite(cloud).all() or before is None:
                 continue
-            for x in cloud.T:
+            for x, x_before in zip(cloud.T, before.T, strict=True):
                 for end in (x.min(), x.max()):
-                    if end != x.mean() and (x == end).sum() > 2 and len(np.unique(cloud[x == end], axis=0)) > 2:
+                    held = x == end
+                    if (
+                        held.sum() > 2
+                        and end != x.mean()
+                        and min(_different(cloud[held]), _different(x_before[held])) > 2
+                    ):
                         found.append(int(table.step[row]))
                         most = max(most, float((x == end).mean()))
     if found:
@@ -92,6 +100,19 @@ def clamped(case: Case) -> Iterator[Finding]:
             "held at a bound, where they pile up and pull the mean",
             "let particles leave the area, and let their likelihood deal with them; or draw those anew that leave",
         )  # fmt: skip
+
+
+def _before(case: Case, table: StageTable, row: int) -> Array | None:
+    """The states (N, n) before a stage; None where they were not kept."""
+    found = case.run.before(table, row)
+    if found is None or "states" not in found[0].values:
+        return None
+    states: Array = found[0].values["states"][found[1]]
+    return states if np.isfinite(states).all() and states.shape == table.values["states"][row].shape else None
+
+
+def _different(values: Array) -> int:
+    return len(np.unique(values, axis=0))
 
 
 def several_modes(case: Case) -> Iterator[Finding]:
@@ -157,7 +178,7 @@ def far(case: Case) -> Iterator[Finding]:
     for table in run.stages.values():
         if not {"log_likelihoods", "states"} <= table.values.keys() or not inputs:
             continue
-        best = np.nanmax(table.values["log_likelihoods"], axis=1)
+        best = np.nan_to_num(table.values["log_likelihoods"], nan=-np.inf).max(axis=1)
         row = np.searchsorted(run.step, table.step)
         m = sum(np.isfinite(run.inputs[name][row]).sum(1) for name in inputs)
         rows = np.isfinite(best) & (m > 0) & (table.step >= case.first)
