@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from viz_estim.core.names import check_name
 from viz_estim.core.run import Scenario, Tick
+from viz_estim.core.yielded import shape_of
 from viz_estim.errors import BadInput
 
 
@@ -24,7 +23,7 @@ def check_scenario(scenario: Any, name: str) -> None:
         space = scenario.space
         shape = (len(scenario.ticks), 1 if space is None else len(space.names))
         wanted = "the label's index" if space is None else ", ".join(space.names)
-        found = np.shape(scenario.truth) if isinstance(scenario.truth, np.ndarray) else type(scenario.truth).__name__
+        found = shape_of(scenario.truth)
         if found != shape:
             raise BadInput(f"{name}: truth: expected an array {shape}, a row a tick ({wanted}), got {found}")
 
@@ -34,8 +33,7 @@ def _check_belief(belief: Any, what: str) -> None:
         kinds = "Gaussian, Particles or Categorical of viz_estim.core.beliefs"
         raise BadInput(f"{what}: expected a {kinds}, got {type(belief).__name__}")
     for field, shape in belief.shapes.items():
-        value = getattr(belief, field)
-        found = np.shape(value) if isinstance(value, np.ndarray) else type(value).__name__
+        found = shape_of(getattr(belief, field))
         if found != shape:
             raise BadInput(f"{what}: {field}: expected an array {shape}, got {found}")
 

@@ -35,9 +35,8 @@ class Yielded:
         try:
             for name, shape in self.shapes.items():
                 value = getattr(stage.belief, name, None)
-                if not isinstance(value, np.ndarray) or value.shape != shape:
-                    got = value.shape if isinstance(value, np.ndarray) else type(value).__name__
-                    raise ValueError(f"expected a {name} of shape {shape}, got {got}")
+                if shape_of(value) != shape:
+                    raise ValueError(f"expected a {name} of shape {shape}, got {shape_of(value)}")
             if not self._trusted:
                 self._check_fields(stage)
         except (TypeError, ValueError) as error:
@@ -101,6 +100,11 @@ class Yielded:
         first = self._first.setdefault((stage, name), shape)
         if shape != first:
             raise ValueError(f"{name}: expected {first} as before, got {shape}; fill up with NaN what is missing")
+
+
+def shape_of(value: Any) -> Shape | str:
+    """An array's shape; of anything else the name of its type."""
+    return value.shape if isinstance(value, np.ndarray) else type(value).__name__
 
 
 def _expect(name: str, value: Any, shape: Shape) -> None:
