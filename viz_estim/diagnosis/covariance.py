@@ -89,7 +89,7 @@ def claims(case: Case) -> Iterator[Finding]:
         C, S = table.values["innovation.cross_cov"], table.values["innovation.cov"]
         numbers = (before, S, table.cov, C)
         rows = np.asarray(np.all([np.isfinite(A).all((1, 2)) for A in numbers], axis=0))
-        rows[rows] &= _sound(before[rows]) & _sound(S[rows]) & _sound(table.cov[rows])
+        rows[rows] &= sound(before[rows]) & sound(S[rows]) & sound(table.cov[rows])
         if not rows.any():
             continue
         least = before[rows] - C[rows] @ np.linalg.solve(S[rows], np.swapaxes(C[rows], 1, 2))
@@ -97,7 +97,7 @@ def claims(case: Case) -> Iterator[Finding]:
             A = case.space.transport(mean[rows], case.space.minus(table.mean[rows], mean[rows]))
             least = A @ least @ np.swapaxes(A, 1, 2)
         least = 0.5 * (least + np.swapaxes(least, 1, 2))
-        fine = _sound(least)
+        fine = sound(least)
         if not fine.any():
             continue
         L = np.linalg.cholesky(least[fine])
@@ -198,7 +198,7 @@ def unobservable(case: Case) -> Iterator[Finding]:
         for i, name in enumerate(space.parts):
             b = blind[:, :, i]
             rows = (np.abs(b).max(1) > 0) & np.isfinite(cov).all((1, 2)) & (table.step >= case.first)
-            rows[rows] &= _sound(cov[rows]) & _sound(table.cov[rows])
+            rows[rows] &= sound(cov[rows]) & sound(table.cov[rows])
             if not rows.any():
                 continue
             carried = case.space.transport(mean[rows], case.space.minus(table.mean[rows], mean[rows]))
@@ -219,7 +219,8 @@ def unobservable(case: Case) -> Iterator[Finding]:
                 )  # fmt: skip
 
 
-def _sound(P: Array) -> np.ndarray:
+def sound(P: Array) -> np.ndarray:
+    """Which of covariances (M, d, d) are positive definite, and well enough conditioned to be solved with."""
     values = np.linalg.eigvalsh(P)
     return (values[:, 0] > 0) & (values[:, -1] < 1e14 * np.maximum(values[:, 0], 1e-300))
 

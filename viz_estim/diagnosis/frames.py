@@ -49,13 +49,17 @@ def turned_attitudes(one: Against) -> Iterator[Cause]:
 def _turn(one: Against, left: float, k: int, turn: str, words: str) -> Iterator[Cause]:
     own, (M, m) = float((white(one, one.r) ** 2).sum()), one.r.shape
     gain, explained = 0.5 * M * m * float(np.log(own / max(left, 1e-300))), 1 - left / max(own, 1e-300)
-    p = float(np.exp(-np.clip(gain - 0.5 * k * np.log(M), 0.0, 700.0)))
     yield Cause(
-        "units_or_axes", gain, k, p, own > GROSS * left, float(np.sqrt(own / (M * m))), explained,
+        "units_or_axes", gain, k, _penalised(gain, k, M), own > GROSS * left, float(np.sqrt(own / (M * m))), explained,
         {"map": f"turned by {turn}", "log_likelihood_gain": gain},
         f"readings of {one.label} are turned by {turn} against the truth{words or ': they are in another frame'}",
         f"turn the readings of {one.label} back into the frame that h(x) is in, or put that rotation into h(x)", True,
     )  # fmt: skip
+
+
+def _penalised(gain: float, k: int, M: int) -> float:
+    """A bound of p: the likelihood ratio, less what k fitted numbers gain by themselves (Schwarz 1978)."""
+    return float(np.exp(-np.clip(gain - 0.5 * k * np.log(M), 0.0, 700.0)))
 
 
 def conventions(one: Against) -> Iterator[Cause]:
@@ -122,7 +126,7 @@ def misplaced(one: Against) -> Iterator[Cause]:
         gain = 0.5 * M * m * float(np.log(own.sum() / max(left, 1e-300)))
         at, taken = (f"({', '.join(f'{v:.3g}' for v in p)}) m" for p in (place, one.places[i]))
         yield Cause(
-            "units_or_axes", gain, d, float(np.exp(-np.clip(gain - 0.5 * d * np.log(M), 0.0, 700.0))),
+            "units_or_axes", gain, d, _penalised(gain, d, M),
             bool(own.sum() > GROSS * left), float(np.sqrt(own[i] / M)), 1 - left / max(float(own.sum()), 1e-300),
             {"map": f"place {at}", "log_likelihood_gain": gain},
             f"readings of {one.axis(i)} are distances from {at}, and the filter takes them from {taken}",

@@ -14,8 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
+from viz_estim.diagnosis.covariance import sound
 from viz_estim.diagnosis.evidence import Case, tells_gain, tells_reading
 from viz_estim.diagnosis.finding import GROSS, Finding, Severity
 from viz_estim.recording.tables import StageTable
@@ -73,7 +75,7 @@ def _told(case: Case, table: StageTable) -> Told | None:
     for name in ("cov", "innovation.cov", "innovation.noise", "innovation.cross_cov", "gain"):
         rows &= np.isfinite(get[name]).all((1, 2))
     rows &= np.isfinite(P).all((1, 2)) & np.isfinite(get["innovation.residual"]).all(1)
-    rows[rows] &= _sound(P[rows]) & _sound(get["innovation.cov"][rows])
+    rows[rows] &= sound(symmetrised(P[rows])) & sound(symmetrised(get["innovation.cov"][rows]))
     if rows.sum() < _FEWEST:
         return None
     moved, after = case.space.minus(table.mean[rows], mean[rows]), table.cov[rows]
@@ -132,7 +134,7 @@ def _gain(told: Told) -> _Line | None:
             "reading", "write K = P·Hᵀ·S⁻¹, and add K·ν to the mean",
         )  # fmt: skip
     best = told.P - told.C @ np.linalg.solve(told.S, np.swapaxes(told.C, 1, 2))
-    if not _sound(best).all():
+    if not sound(symmetrised(best)).all():
         return None
     _, high = _ratios(_left(told), best)
     if (severity := _severity(high, told)) is None:
@@ -172,7 +174,7 @@ def _mean(told: Told) -> _Line | None:
 def _cov(told: Told) -> _Line | None:
     """P⁺ = P − K·Cᵀ − C·Kᵀ + K·S·Kᵀ."""
     left = _left(told)
-    if not _sound(left).all():
+    if not sound(left).all():
         return None
     low, high = _ratios(told.after, left)
     severity = _severity(np.maximum(high, 1 / np.maximum(low, 1e-300)), told)
@@ -202,14 +204,14 @@ def _cov(told: Told) -> _Line | None:
 def _left(told: Told) -> Array:
     KC = told.K @ np.swapaxes(told.C, 1, 2)
     left = told.P - KC - np.swapaxes(KC, 1, 2) + told.K @ told.S @ np.swapaxes(told.K, 1, 2)
-    return np.asarray(0.5 * (left + np.swapaxes(left, 1, 2)))
+    return symmetrised(left)
 
 
 def _ratios(A: Array, B: Array) -> tuple[Array, Array]:
     """The smallest and the largest eigenvalue (M,) of B⁻¹·A, symmetric matrices."""
-    values, vectors = np.linalg.eigh(0.5 * (B + np.swapaxes(B, 1, 2)))
+    values, vectors = np.linalg.eigh(symmetrised(B))
     root = vectors / np.sqrt(np.maximum(values, 1e-300))[:, None, :]
-    found = np.linalg.eigvalsh(np.swapaxes(root, 1, 2) @ (0.5 * (A + np.swapaxes(A, 1, 2))) @ root)
+    found = np.linalg.eigvalsh(np.swapaxes(root, 1, 2) @ symmetrised(A) @ root)
     return found[:, 0], found[:, -1]
 
 
@@ -223,8 +225,3 @@ def _severity(ratio: Array, told: Told) -> Severity | None:
 
 def _alike(A: Array, B: Array) -> bool:
     return bool(np.median(np.abs(A - B).max((1, 2)) / np.maximum(np.abs(B).max((1, 2)), 1e-300)) < _ALIKE)
-
-
-def _sound(P: Array) -> np.ndarray:
-    values = np.linalg.eigvalsh(0.5 * (P + np.swapaxes(P, 1, 2)))
-    return np.asarray((values[:, 0] > 0) & (values[:, -1] < 1e14 * np.maximum(values[:, 0], 1e-300)))
