@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from viz_estim.core.consistency import FIT
 from viz_estim.core.distributions import binom, chi2, f
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
@@ -20,7 +21,7 @@ def is_registration(case: Case) -> bool:
 
 
 def _fits(case: Case) -> StageTable | None:
-    return next((t for t in case.run.stages.values() if "rmse" in t.values and "converged" in t.values), None)
+    return next((t for t in case.run.stages.values() if t.values.keys() >= FIT), None)
 
 
 def settled(case: Case) -> Iterator[Finding]:
@@ -83,10 +84,10 @@ def few_matches(case: Case) -> Iterator[Finding]:
     matched = next((t for t in case.run.stages.values() if "matches.distance" in t.values), None)
     if matched is None or not len(matched.step):
         return
-    fits, N = _fits(case), _points(case)
-    ends = fits is not None and "count" in fits.values and len(fits.step) and case.run.error is None
+    fits, N, count = _fits(case), _points(case), len(matched.values["matches.distance"][-1])
     # The fit's own count is kept where the matches are thinned; one that failed has none.
-    count = int(fits.values["count"].ravel()[-1]) if fits and ends else len(matched.values["matches.distance"][-1])
+    if fits is not None and len(fits.step) and "count" in fits.values and case.run.error is None:
+        count = int(fits.values["count"].ravel()[-1])
     severity = judge(float(binom.cdf(count, N, _HALF)), 1, large=count < 0.5 * _HALF * N)
     if severity or count < 3:
         steps = int(matched.step[0]), int(matched.step[-1])

@@ -85,13 +85,11 @@ def clamped(case: Case) -> Iterator[Finding]:
             for x, x_before in zip(cloud.T, before.T, strict=True):
                 for end in (x.min(), x.max()):
                     held = x == end
-                    if (
-                        held.sum() > 2
-                        and end != x.mean()
-                        and min(_different(cloud[held]), _different(x_before[held])) > 2
-                    ):
+                    if held.sum() < 3 or end == x.mean():
+                        continue
+                    if _different(cloud[held]) > 2 and _different(x_before[held]) > 2:
                         found.append(int(table.step[row]))
-                        most = max(most, float((x == end).mean()))
+                        most = max(most, float(held.mean()))
     if found:
         yield Finding(
             "particles_clamped", "error" if most > scatter else "warning", None, (min(found), max(found)),
@@ -104,10 +102,11 @@ def clamped(case: Case) -> Iterator[Finding]:
 
 def _before(case: Case, table: StageTable, row: int) -> Array | None:
     """The states (N, n) before a stage; None where they were not kept."""
-    found = case.run.before(table, row)
-    if found is None or "states" not in found[0].values:
+    place = int(table.place[row])
+    past = case.sequence.stage[place - 1] if place else None
+    if past is None or "states" not in past[0].values:
         return None
-    states: Array = found[0].values["states"][found[1]]
+    states: Array = past[0].values["states"][past[1]]
     return states if np.isfinite(states).all() and states.shape == table.values["states"][row].shape else None
 
 

@@ -99,7 +99,7 @@ class Clouds:
         if rows.equal_weights.all():
             columns += drawn(kind, 1, len(at), colors=np.full(len(at), schema.by_weight(np.ones(1))))
         else:
-            share = rows.array("belief.log_weights")[kept].astype(np.float32)
+            share = rows.some("belief.log_weights", kept).astype(np.float32)
             share -= share.max(axis=1, keepdims=True)
             columns += drawn(kind, N, len(at), colors=schema.by_weight(np.exp(share)))
         send(self._stream, self._path, at, columns)
