@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from itertools import chain, islice
 from operator import attrgetter, is_, itemgetter
 from typing import Any
 
@@ -26,11 +27,14 @@ class StageRows:
     ) -> None:  # fmt: skip
         self.name, self.stages, self.at, self.rows = name, stages, at, rows
         self.first, self.last, self.before = first, last, before
+        self._objects: dict[str, list[Any]] = {}
         self._gathered: dict[str, Any] = {}
 
     def objects(self, path: str) -> list[Any]:
         """A quantity of each record by its attribute path, such as `innovation.residual`."""
-        return list(map(attrgetter(path), self.stages))
+        if path not in self._objects:
+            self._objects[path] = list(map(attrgetter(path), self.stages))
+        return self._objects[path]
 
     def values(self, path: str) -> Array | list[Array]:
         """The same as one array (M, …), or as a list where shapes differ."""
@@ -102,9 +106,13 @@ class Batch:
     def __init__(self, steps: list[Step], first: int, before: Stage | None = None) -> None:
         self.steps = steps
         self._stages = list(map(_STAGES, steps))
-        self.kind, self.kinds, _ = _kinds([tuple(map(_NAME, stages)) for stages in self._stages])
+        names, sizes = map(_NAME, chain.from_iterable(self._stages)), list(map(len, self._stages))
+        same = sizes[0] if len(set(sizes)) == 1 else 0  # as is usual: several times as fast
+        self.kind, self.kinds, _ = kinds_of(
+            list(zip(*[names] * same, strict=True)) if same else [tuple(islice(names, size)) for size in sizes]
+        )
         ticks = list(map(_TICK, steps))
-        self.tick_kind, _, examples = _kinds(_sensors(ticks))
+        self.tick_kind, _, examples = kinds_of(_sensors(ticks))
         self.ticks = [ticks[row] for row in examples]
         # A step without any stage (it failed at once) still takes a place on the stage timeline.
         counts = np.array([max(1, len(names)) for names in self.kinds])[self.kind]
@@ -178,17 +186,20 @@ class Batch:
     def beliefs(self, path: str) -> Array:
         """A quantity of the belief after each of all stages, in order, such as `mean` (M, n)."""
         parts = [rows.array(f"belief.{path}") for rows in self.stages]
-        return (parts[0] if len(parts) == 1 else np.concatenate(parts))[self._order]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)[self._order]
 
     @cached_property
     def end_moments(self) -> tuple[Array, Array]:
         """Mean (N, n) and covariance (N, d, d) at the end of each step; of clouds, many at once."""
-        ended = [self.steps[row].stages[-1].belief for row in self.end_rows.tolist()]
-        if ended and isinstance(ended[0], Particles):
+        if self.stages and isinstance(self.stages[0].stages[0].belief, Particles):
+            ended = [self.steps[row].stages[-1].belief for row in self.end_rows.tolist()]
             space, size = ended[0].space, max(1, 20_000 // len(ended[0].log_weights))
             groups = [ended[i : i + size] for i in range(0, len(ended), size)]
             found = [moments(space, _states(group), _log_weights(group)) for group in groups]
             return np.concatenate([mean for mean, _ in found]), np.concatenate([cov for _, cov in found])
+        enders = [rows for rows in self.stages if rows.last.any()]
+        if len(enders) == 1 and enders[0].last.all():  # as is usual: nothing to put in order
+            return enders[0].array("belief.mean"), enders[0].array("belief.cov")
         return self.beliefs("mean")[self.ends], self.beliefs("cov")[self.ends]
 
     @cached_property
@@ -196,7 +207,7 @@ class Batch:
         """The truth (N, n), NaN where there is none; of a run that has one."""
         size = next((len(step.truth) for step in self.steps if step.truth is not None), 0)
         nothing = np.full(size, np.nan)
-        return np.array([nothing if step.truth is None else step.truth for step in self.steps])
+        return np.asarray(stacked([nothing if step.truth is None else step.truth for step in self.steps]))
 
 
 def _states(beliefs: list[Particles]) -> Array:
@@ -235,16 +246,24 @@ _STAGES, _NAME, _INDEX, _TICK = map(attrgetter, ("stages", "name", "index", "tic
 _TIME, _MEASUREMENTS, _RAW, _FAULTS = map(attrgetter, ("time", "measurements", "raw", "faults"))
 
 
-def _kinds(keys: list[Any]) -> tuple[np.ndarray, list[Any], list[int]]:
+def kinds_of(keys: list[Any]) -> tuple[np.ndarray, list[Any], list[int]]:
     """The number of each key (N,) among the different ones, these, and the first row of each."""
     first: dict[Any, int] = {}
-    rows, number = np.unique(list(map(first.setdefault, keys, range(len(keys)))), return_inverse=True)
+    found = list(map(first.setdefault, keys, range(len(keys))))
+    if len(first) == 1:
+        return np.zeros(len(keys), int), list(first), [0]
+    rows, number = np.unique(found, return_inverse=True)
     return number, list(first), rows.tolist()
 
 
 def _sensors(ticks: list[Tick]) -> list[Any]:
     """What ticks have in common: which sensors they have readings of, and what is wrong with these."""
-    read: list[Any] = list(zip(map(tuple, map(_MEASUREMENTS, ticks)), map(tuple, map(_RAW, ticks)), strict=True))
-    for row in np.flatnonzero(list(map(bool, map(_FAULTS, ticks)))).tolist():
-        read[row] = (*read[row], *ticks[row].faults.items(), *ticks[row].stand_ins)
-    return read
+    read, raw = (list(map(tuple, map(of, ticks))) for of in (_MEASUREMENTS, _RAW))
+    faults = list(map(_FAULTS, ticks))
+    if len(set(raw)) == 1 and not any(faults):
+        return read
+    found: list[Any] = list(zip(read, raw, strict=True))
+    for row, faulty in enumerate(faults):
+        if faulty:
+            found[row] = (*found[row], *faulty.items(), *ticks[row].stand_ins)
+    return found

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from viz_estim.core.run import Scenario
 from viz_estim.core.scenery import Camera, Cloud, Landmarks, Path
 from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product, Space
 from viz_estim.core.stages import Innovation, Matches, SigmaPoints
-from viz_estim.recording.batch import Batch, StageRows
+from viz_estim.recording.batch import Batch, StageRows, kinds_of
 
 KEPT = 4000  # particles of a cloud at most: more are thinned by weight
 
@@ -167,10 +168,11 @@ class Layout:
 
 def _silences(scenario: Scenario) -> dict[str, set[int]]:
     """By sensor, the steps before its first reading, and within a gap of more than five times its usual interval."""
-    together = [(*tick.measurements, *tick.raw) for tick in scenario.ticks]
+    readings, raw = (kinds_of(list(map(tuple, map(attrgetter(of), scenario.ticks)))) for of in ("measurements", "raw"))
     silent = {}
-    for sensor in dict.fromkeys(name for names in dict.fromkeys(together) for name in names):
-        came = np.flatnonzero([sensor in names for names in together])
+    for sensor in dict.fromkeys(name for _, kinds, _ in (readings, raw) for names in kinds for name in names):
+        there = (np.array([sensor in names for names in kinds])[kind] for kind, kinds, _ in (readings, raw))
+        came = np.flatnonzero(np.logical_or(*there))
         usual = float(np.median(np.diff(came))) if len(came) > 1 else 1.0
         ends = np.concatenate([[-1], came, [len(scenario.ticks)]])
         gaps = np.flatnonzero((np.diff(ends) > 5 * usual) | (ends[:-1] < 0))
