@@ -226,6 +226,7 @@ def test_quaternions_agree_with_scipy_s_rotations() -> None:
     close(matrix(quaternions.multiply(p, q)), (Rotation.from_quat(p, scalar_first=True) * R).as_matrix(), atol=1e-14)
     assert gap(SO3(), quaternions.from_matrix(R.as_matrix()), q) < 1e-14
     assert (quaternions.from_matrix(R.as_matrix())[:, 0] >= 0).all()
+    assert gap(SO3(), quaternions.from_rotation(R.as_matrix()), q) < 1e-14
     close(quaternions.rotate(q, v), R.apply(v), atol=1e-13)
     close(quaternions.cross(q[:, 1:], v), np.cross(q[:, 1:], v), atol=1e-15)
     close(np.linalg.norm(quaternions.log(q), axis=1), R.magnitude(), rtol=1e-13)

@@ -100,6 +100,22 @@ def from_matrix(r: Array) -> Array:
 
     The nearest rotation is taken where a matrix is a little off orthonormal.
     """
+    q = np.linalg.eigh(_symmetric(r))[1][..., :, -1]
+    return q * np.where(q[..., :1] < 0, -1.0, 1.0)
+
+
+def from_rotation(r: Array) -> Array:
+    """The same of matrices that are rotations to rounding, in a fifth of the time; of either sign.
+
+    The symmetric matrix of a rotation is 4·q·qᵀ − 1: q is its longest column with 1 added, at length 1.
+    """
+    k = _symmetric(r) + np.eye(4)
+    longest = np.argmax(np.diagonal(k, axis1=-2, axis2=-1), axis=-1)
+    return normalise(np.take_along_axis(k, longest[..., None, None], axis=-1)[..., 0])
+
+
+def _symmetric(r: Array) -> Array:
+    """Bar-Itzhack's matrix (*, 4, 4) of (*, 3, 3): of a rotation's, q is the eigenvector to the eigenvalue 3."""
     r = np.asarray(r, float)
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     k = np.empty((*r.shape[:-2], 4, 4))
@@ -110,8 +126,7 @@ def from_matrix(r: Array) -> Array:
     k[..., 1, 2] = k[..., 2, 1] = r[..., 1, 0] + r[..., 0, 1]
     k[..., 1, 3] = k[..., 3, 1] = r[..., 2, 0] + r[..., 0, 2]
     k[..., 2, 3] = k[..., 3, 2] = r[..., 2, 1] + r[..., 1, 2]
-    q = np.linalg.eigh(k)[1][..., :, -1]
-    return q * np.where(q[..., :1] < 0, -1.0, 1.0)
+    return k
 
 
 def to_euler(q: Array) -> Array:

@@ -196,7 +196,7 @@ def axes_of(cov: Array) -> tuple[Array, Array]:
         zero = np.zeros_like(half)
         return flat3(sizes[:, ::-1]), np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)
     vectors[:, :, 0] *= np.linalg.det(vectors)[:, None]  # a rotation, not a mirror
-    return sizes, quaternions.from_matrix(vectors)
+    return sizes, quaternions.from_rotation(vectors)
 
 
 def sphere(radius: float) -> rr.Ellipsoids3D:
@@ -213,5 +213,6 @@ def xyzw(q: Array) -> Array:
 
 def tips(q: Array) -> Array:
     """The tips (*, 3, 3) of the body's x, y and z axes in the world, for quaternions (*, 4), as they are drawn."""
-    # Its columns, as rows: the inverse turn's.
-    return quaternions.to_matrix(np.asarray(quaternions.conjugate(q), np.float32))
+    inverse = np.array(q, np.float32)  # whose rows are the columns
+    inverse[..., 0] *= -1
+    return quaternions.to_matrix(inverse)
