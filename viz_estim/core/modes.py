@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
 
+_EPS = float(np.finfo(float).eps)
 _ROUNDS = 30
 _REACH = 5.0  # σ either way: a mode of weight p lies at most 1/√p away
 _SMOOTH = 2.0  # cells to a kernel's σ
@@ -34,18 +35,20 @@ def moments(space: Space, states: Array, log_weights: Array) -> tuple[Array, Arr
     """
     # Each component in one piece: numpy is fast along long axes.
     states = np.moveaxis(np.ascontiguousarray(np.moveaxis(states, -1, 0)), 0, -1)
+    alike = not log_weights.strides[-1]  # one number for all: to look for the heaviest takes as long as all else
     weights = _weights(log_weights)[..., None]
-    heaviest = log_weights.argmax(-1)[..., None, None]
-    mean = np.take_along_axis(states, heaviest, axis=-2)
-    settled = max(1e-10, 64 * np.finfo(float).eps * float(np.abs(states).max()))
-    for _ in range(_ROUNDS):
+    heaviest = states[..., :1, :] if alike else np.take_along_axis(states, log_weights.argmax(-1)[..., None, None], -2)
+    mean = heaviest
+    for rounds in range(_ROUNDS):
         error = space.minus(states, mean)
         across = np.swapaxes(error, -1, -2)
         step = np.swapaxes(across @ weights, -1, -2)
         mean = space.plus(mean, step)
-        if np.abs(step).max() < settled:
+        left = float(np.abs(step).max())
+        if left < 1e-10 or (rounds > 1 and left < 64 * _EPS * float(np.abs(states).max())):
             break
-    cov = (across * np.swapaxes(weights, -1, -2)) @ error
+    # One product a pair of components: BLAS takes thrice as long for matrices that are so long and thin.
+    cov = np.vecdot((across * np.swapaxes(weights, -1, -2))[..., :, None, :], across[..., None, :, :])
     return mean[..., 0, :], 0.5 * (cov + np.swapaxes(cov, -1, -2))
 
 
@@ -63,19 +66,26 @@ def modes(space: Space, states: Array, log_weights: Array, least: float = 0.05) 
     of either), a histogram smoothed with Silverman's width (1986, eq. 4.14): each cell climbs to its peak, and peaks
     without a valley between them are one mode. So are clouds that differ in heading alone.
     """
+    return _described(space, states, log_weights, *_apart(space, states, log_weights), least)
+
+
+def several(space: Space, states: Array, log_weights: Array, least: float = 0.05) -> tuple[Mode, ...]:
+    """The same where they are more than one, else none: half the work, where most clouds have one."""
     label, share = _apart(space, states, log_weights)
+    if int((share >= least).sum()) < 2:
+        return ()
+    return _described(space, states, log_weights, label, share, least)
+
+
+def _described(
+    space: Space, states: Array, log_weights: Array, label: np.ndarray, share: Array, least: float
+) -> tuple[Mode, ...]:
     found = []
     for i in np.flatnonzero(share >= least):
         members = label == i
         mean, cov = moments(space, states[members], log_weights[members] - np.log(share[i]))
         found.append(Mode(float(share[i]), mean, cov))
     return tuple(sorted(found, key=lambda mode: -mode.weight))
-
-
-def several(space: Space, states: Array, log_weights: Array, least: float = 0.05) -> bool:
-    """Whether `modes` finds more than one: half the work, where most clouds have one."""
-    _, share = _apart(space, states, log_weights)
-    return int((share >= least).sum()) > 1
 
 
 def _apart(space: Space, states: Array, log_weights: Array) -> tuple[np.ndarray, Array]:

@@ -50,7 +50,7 @@ def weigh(belief: Particles, log_likelihood: LogLikelihood, tick: Tick, *, name:
     log_likelihoods = np.maximum(log_likelihood(read_only(belief.states), tick), LOG_ZERO)  # log 0 is a number here
     log_weights = belief.log_weights + log_likelihoods
     best = np.maximum.reduce(log_weights, axis=-1, keepdims=True)
-    if not (best > LOG_ZERO / 2).all():  # nor NaN
+    if not all(one > LOG_ZERO / 2 for one in best.ravel().tolist()):  # nor NaN
         raise ArithmeticError("no particle has a likelihood above 0: none can give what was read")
     weights = log_weights - best
     np.exp(weights, out=weights)

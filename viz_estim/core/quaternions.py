@@ -85,7 +85,7 @@ def cross(a: Array, b: Array) -> Array:
     return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
 
 
-def to_matrix(q: Array) -> Array:
+def to_matrix(q: np.ndarray) -> Array:
     """Rotation matrices (*, 3, 3): world_R_body for world_q_body; in single precision of such quaternions."""
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     r = np.empty((*q.shape[:-1], 3, 3), np.result_type(q, np.float32))  # stacking rows takes three times as long

@@ -137,12 +137,13 @@ def run(scenario: Scenario, seed: int = 0, *, first: int = 0, belief: Belief | N
         assert belief is not None, "a scenario sets a belief at step 0"
         try:
             for made in scenario.estimator.step(belief if pure else _own(belief), tick, chance.at(k)):
-                yielded.check(made)
+                yielded.check(made, belief)
                 stage = made if pure else _own(made)
                 stages.append(stage)
                 before, belief = belief, stage.belief
                 for name in yielded.shapes:
-                    if not _finite(getattr(belief, name), getattr(before, name)):
+                    values = getattr(belief, name)
+                    if values is not getattr(before, name) and not _finite(values):  # else they were looked at
                         raise NotFinite("the belief is no longer finite")
         except Exception as failure:  # whatever a person's filter raises is what they came to see
             text = f"{type(failure).__name__}: {failure}"
@@ -170,10 +171,8 @@ def _own(value: Any) -> Any:
     return owned
 
 
-def _finite(values: Array, before: Array) -> bool:
-    """Whether all values are; those that the belief before held have been looked at."""
-    if values is before:
-        return True
+def _finite(values: Array) -> bool:
+    """Whether all values are."""
     # A finite sum of squares has finite terms, and is quicker to see; one that is not may have overflowed. Not of many:
     # BLAS then wakes a thread on each core, which waits there in a busy loop.
     flat = values.ravel()

@@ -268,16 +268,17 @@ class Product:
         self.units = tuple(u for part in parts.values() for u in part.units)
         self.axis_units = tuple(u for part in parts.values() for u in part.axis_units)
         self.flat = all(part.flat for part in parts.values())
+        self._slices = [(part, self.at[name]) for name, part in self.parts.items()]
 
     def plus(self, x: Array, delta: Array) -> Array:
         moved = [part.plus(x[..., self.at[k]], delta[..., self.axes_at[k]]) for k, part in self.parts.items()]
         return np.concatenate(moved, axis=-1)
 
     def minus(self, y: Array, x: Array) -> Array:
-        return np.concatenate([part.minus(y[..., s], x[..., s]) for part, s in self._slices()], axis=-1)
+        return np.concatenate([part.minus(y[..., s], x[..., s]) for part, s in self._slices], axis=-1)
 
     def mean(self, points: Array, weights: Array) -> Array:
-        return np.concatenate([part.mean(points[..., s], weights) for part, s in self._slices()], axis=-1)
+        return np.concatenate([part.mean(points[..., s], weights) for part, s in self._slices], axis=-1)
 
     def transport(self, x: Array, delta: Array) -> Array:
         A = _identity(delta).copy()
@@ -287,14 +288,13 @@ class Product:
                 A[..., at, at] = part.transport(x[..., self.at[name]], delta[..., at])
         return A
 
-    def _slices(self) -> list[tuple[Space, slice]]:
-        return [(part, self.at[name]) for name, part in self.parts.items()]
-
 
 def wrap(angle: Array) -> Array:
     """The same angles in [−π, π). Of many, those that are already are seen in a tenth of the time of a division."""
     turned = angle + np.pi
     if np.size(turned) <= 100:
         return turned % (2 * np.pi) - np.pi
-    turned[(turned < 0) | (turned >= 2 * np.pi)] %= 2 * np.pi
-    return turned - np.pi
+    if not (turned.min() >= 0 and turned.max() < 2 * np.pi):  # nor where one is NaN
+        turned[(turned < 0) | (turned >= 2 * np.pi)] %= 2 * np.pi
+    turned -= np.pi
+    return turned

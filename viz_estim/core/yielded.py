@@ -28,14 +28,17 @@ class Yielded:
         self._types: dict[str, type] = {}
         self._first: dict[tuple[str, str], Any] = {}  # by stage and field: the shape, or the sensors' components
 
-    def check(self, stage: Any) -> None:
-        """TypeError or ValueError, with the stage's name on it, where it is no stage or does not fit."""
+    def check(self, stage: Any, before: Any) -> None:
+        """TypeError or ValueError, with the stage's name on it, where it is no stage or does not fit.
+
+        before: the belief before it, which did.
+        """
         if not isinstance(stage, Stage):
             raise TypeError(f"step() must yield stages, got {type(stage).__name__}")
         try:
             for name, shape in self.shapes.items():
                 value = getattr(stage.belief, name, None)
-                if shape_of(value) != shape:
+                if value is not getattr(before, name) and shape_of(value) != shape:
                     raise ValueError(f"expected a {name} of shape {shape}, got {shape_of(value)}")
             if not self._trusted:
                 self._check_fields(stage)

@@ -193,7 +193,7 @@ class Batch:
         """Mean (N, n) and covariance (N, d, d) at the end of each step; of clouds, many at once."""
         if self.stages and isinstance(self.stages[0].stages[0].belief, Particles):
             ended = [self.steps[row].stages[-1].belief for row in self.end_rows.tolist()]
-            space, size = ended[0].space, max(1, 20_000 // len(ended[0].log_weights))
+            space, size = ended[0].space, max(1, 10_000 // len(ended[0].log_weights))
             groups = [ended[i : i + size] for i in range(0, len(ended), size)]
             found = [moments(space, _states(group), _log_weights(group)) for group in groups]
             return np.concatenate([mean for mean, _ in found]), np.concatenate([cov for _, cov in found])

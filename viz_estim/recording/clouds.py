@@ -23,7 +23,7 @@ from viz_estim.recording.layout import KEPT, Layout, place_of
 from viz_estim.recording.standing import Standing
 
 _LINES = 250  # of ancestry, at most
-_LOOKS = 75  # how often in a run its modes are looked for: that takes longer than a step of a small filter
+_LOOKS = 50  # how often in a run its modes are looked for: that takes longer than a step of a small filter
 
 
 class Clouds:
@@ -132,9 +132,8 @@ class Clouds:
         layout, found = self._layout, []
         assert layout.position
         for i in chosen:
-            step = batch.steps[batch.end_rows[i]]
-            belief: Any = step.stages[-1].belief
-            found.append(belief.modes() if several(belief.space, belief.states, belief.log_weights) else ())
+            belief: Any = batch.steps[batch.end_rows[i]].stages[-1].belief
+            found.append(several(belief.space, belief.states, belief.log_weights))
         every = [mode for modes in found for mode in modes]
         at = batch.at.pick(batch.ends[chosen])
         axes = layout.space.axes_at[layout.position]
