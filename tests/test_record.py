@@ -19,8 +19,10 @@ from filterpy.kalman import (  # type: ignore[import-untyped]
     MerweScaledSigmaPoints,
     UnscentedKalmanFilter,
 )
+from PIL import Image
 
 import viz_estim
+from viz_estim import told
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, Euclidean, Product
 from viz_estim.diagnose import diagnose
@@ -249,6 +251,44 @@ def test_a_cloud_without_a_weight_is_kept_as_it_is(cli: Cli, tmp_path: Path) -> 
     assert np.isnan(run.mean[3]).all()
     for arguments in (["show", tmp_path / "a.rrd", "--step", 3], ["diagnose", tmp_path / "a.rrd"]):
         assert cli(*arguments).code in (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("names", "parts"),
+    [
+        ({"x": "m", "y": "m"}, {"position": 2}),
+        ({"x": "m", "y": "m", "z": "m", "vx": "m/s"}, {"position": 3, "state": 1}),
+        ({"x": "m", "y": "m", "theta": "rad", "v": "m/s", "w": "rad/s"}, {"position": 2, "heading": 1, "state": 2}),
+        ({"x": "m", "y": "m", "theta": "deg"}, {"position": 2, "state": 1}),
+        ({"x": "m", "v": "m/s"}, None),
+        ({"x": "px", "y": "px"}, None),
+        (["x", "y"], None),
+    ],
+)
+def test_a_place_and_a_heading_are_known_by_name_and_unit(names: Any, parts: dict[str, int] | None) -> None:
+    space: Any = told.state_of(names)
+    assert (len(space.names), len(space.axes)) == (len(names), len(names))
+    if parts is None:
+        assert isinstance(space, Euclidean)
+    else:
+        assert {name: len(part.names) for name, part in space.parts.items()} == parts
+    assert list(space.units) == (list(names.values()) if isinstance(names, dict) else [""] * len(names))
+
+
+@pytest.mark.draws
+@pytest.mark.parametrize("knows", [True, False])
+def test_the_view_frames_a_run_of_which_only_the_start_was_known(knows: bool, cli: Cli, tmp_path: Path) -> None:
+    """Far from where it began: the way so far is in the picture, and no speck of it."""
+    with viz_estim.record(tmp_path / "a.rrd", {"x": "m", "y": "m", "theta": "rad"}) as rec:
+        for k in range(60):
+            x = np.array([40 * np.cos(k / 9), 40 * np.sin(k / 9), k / 9])
+            rec.stage("predict", mean=x, cov=np.eye(3))
+            rec.step(time=k, truth=1.1 * x if knows else None)
+    done = cli("snapshot", tmp_path / "a.rrd", "--step", 59, "--size", "800x600", "-o", tmp_path / "a.png")
+    assert (done.code, done.err) == (0, "")
+    pixels = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)[60:400, 10:300]
+    rows, columns = np.nonzero((pixels[..., 0] > 150) & (pixels[..., 2] < 80))  # amber
+    assert min(np.ptp(rows), np.ptp(columns)) > 100
 
 
 @pytest.mark.draws

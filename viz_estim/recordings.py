@@ -38,7 +38,8 @@ def record(
 ) -> Recording:
     """A recording to be told of stages and steps; a context manager, which ends it.
 
-    space: the state's geometry; or its components' names, with their units as a dict; without it they are x0, x1, ….
+    space: the state's geometry; or its components' names, with their units as a dict; without it they are x0, x1, …. A
+    place that comes first (x, y, and z, in m) is drawn in a plan, and a heading right after it (theta, in rad) too.
     Of a filter over labels it is the labels.
     sensors: the same of each sensor's reading, by the name that `stage` calls it; a `Product` is a reading of several.
     """
@@ -56,7 +57,7 @@ class Recording:
     def __init__(self, path: Path, space: told.Names | None, sensors: Mapping[str, told.Names]) -> None:
         check_writable(path, suffix=".rrd")
         self.path = path
-        self._space: Space | None = None if space is None else told.space_of(space)
+        self._space: Space | None = None if space is None else told.state_of(space)
         self._labels: tuple[str, ...] = ()
         self._sensors = {name: told.space_of(names) for name, names in sensors.items()}
         self._measured: dict[str, tuple[str, Product]] = {}  # by stage: the sensor's name, and its reading

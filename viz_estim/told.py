@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike
 from viz_estim.core.beliefs import Belief, Categorical, Gaussian, Particles
 from viz_estim.core.discrete import LOG_ZERO
 from viz_estim.core.quaternions import Array
-from viz_estim.core.spaces import Euclidean, Product, Space
+from viz_estim.core.spaces import SO2, Euclidean, Product, Space
 from viz_estim.core.stages import Innovation, Resample, SigmaPoints, Stage
 
 Names = Space | Mapping[str, str] | Sequence[str]
+_HEADINGS = ("heading", "theta", "yaw", "psi", "θ", "ψ")
 POINTS = ("sigma", "drawn", "propagated", "mapped")  # numbers of a stage that are points; the last in the reading
 
 
@@ -28,6 +29,24 @@ def space_of(names: Names) -> Space:
     if isinstance(names, Sequence):
         return Euclidean(names)
     return names
+
+
+def state_of(names: Names) -> Space:
+    """The same of a state. A place that comes first, x and y (and z) in m, is a part of its own, as is a heading in rad
+    right after it, so that both are drawn in a plan and the heading is compared as an angle."""
+    space = space_of(names)
+    if not isinstance(space, Euclidean):
+        return space
+    size = next((n for n in (3, 2) if space.names[:n] == ("x", "y", "z")[:n] and set(space.units[:n]) == {"m"}), 0)
+    if not size:
+        return space
+    parts: dict[str, Space] = {"position": Euclidean(space.names[:size], "m")}
+    if size == 2 and space.names[2:3] and space.names[2] in _HEADINGS and space.units[2] == "rad":
+        parts["heading"] = SO2()
+        size = 3
+    if space.names[size:]:
+        parts["state"] = Euclidean(space.names[size:], space.units[size:])
+    return Product(**parts)
 
 
 def gaussian(where: str, space: Space | None, mean: ArrayLike, cov: ArrayLike) -> Gaussian:

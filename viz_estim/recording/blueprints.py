@@ -94,7 +94,7 @@ def _scenes(layout: Layout) -> list[_Item]:
 
 
 def _world(layout: Layout, name: str) -> rrb.Spatial3DView:
-    """The world, whole at first; a plan is seen from above. The estimate's trail reaches back to the start."""
+    """The world, whole at first; a plan is seen from above. Trails reach back to the start."""
     assert layout.extent
     (x, y, z), reach = layout.extent
     if layout.planar:
@@ -110,7 +110,7 @@ def _world(layout: Layout, name: str) -> rrb.Spatial3DView:
         eye_controls=eye,
         line_grid=rrb.LineGrid3D(visible=True, spacing=_round(reach / 4), color=(45, 46, 50)),
         background=_BACKGROUND,
-        overrides={f"{schema.WORLD}/estimate/trail": [rrb.VisibleTimeRanges(since)]},
+        overrides={f"{schema.WORLD}/{of}/trail": [rrb.VisibleTimeRanges(since)] for of in ("estimate", "truth")},
     )
 
 

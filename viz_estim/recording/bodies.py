@@ -42,6 +42,7 @@ class Bodies:
         self._styled: set[str] = set()
         self._ellipses: _Ellipsoids  # of the batch's stages, with that of the stage before them in front
         self._places: np.ndarray | None = None  # of their stages, but the first's
+        self._way = False  # whether the true path is known beforehand
         body = next((thing for thing in scenario.scenery.values() if isinstance(thing, Box)), None)
         self._body = np.array(body.sizes if body else _DEFAULT_BODY) / 2
         if layout.attitude:
@@ -76,8 +77,9 @@ class Bodies:
         place = flat3(place_of(layout.space.parts[layout.position], of[layout.position]))
         known = np.isfinite(place).all(1)
         path = f"{schema.WORLD}/{name}"
-        if name == "estimate":
-            self._style(f"{path}/trail", Style(rr.Points3D, colors=[colour], radii=[_TRAIL]))
+        if name == "estimate" or not self._way:
+            shade = colour if name == "estimate" else _dim(colour)
+            self._style(f"{path}/trail", Style(rr.Points3D, colors=[shade], radii=[_TRAIL]))
             self._send(f"{path}/trail", at, drawn(rr.Points3D, known.astype(int), len(at), positions=place[known]))
         assert layout.extent
         reach = 0.08 * layout.extent[1]
@@ -158,7 +160,7 @@ class Bodies:
 
     def _draw_scenery(self, scenario: Scenario) -> None:
         """What stands still: landmarks, other paths, and the whole true path as a thin line."""
-        layout, line = self._layout, tuple(np.array(schema.TRUTH) // 2)
+        layout = self._layout
         for name, thing in scenario.scenery.items():
             path = f"{schema.WORLD}/scenery/{name}"
             if isinstance(thing, Landmarks):
@@ -175,7 +177,8 @@ class Bodies:
             pieces = np.split(flat3(place), np.flatnonzero(known[1:] != known[:-1]) + 1)
             strips = [piece for piece in pieces if np.isfinite(piece).all() and len(piece) > 1]
             if strips:
-                way = rr.LineStrips3D(strips, colors=[line], radii=[_LINE / 2])
+                self._way = True
+                way = rr.LineStrips3D(strips, colors=[_dim(schema.TRUTH)], radii=[_LINE / 2])
                 send_static(self._stream, f"{schema.WORLD}/truth/path", way)
 
     def _style(self, path: str, style: Style) -> None:
@@ -204,6 +207,10 @@ def sphere(radius: float) -> rr.Ellipsoids3D:
         centers=[[0, 0, 0]], half_sizes=[[radius] * 3], fill_mode="MajorWireframe",
         colors=[(70, 70, 78)], line_radii=[0.003 * radius],
     )  # fmt: skip
+
+
+def _dim(colour: schema.Colour) -> tuple[int, ...]:
+    return tuple(np.array(colour) // 2)
 
 
 def xyzw(q: Array) -> Array:

@@ -51,7 +51,7 @@ class Layout:
         self.scenery = scenario.scenery
         self.matched = any(isinstance(thing, Cloud) and thing.moves for thing in scenario.scenery.values())
         self.camera = next((thing for thing in self.scenery.values() if isinstance(thing, Camera)), None)
-        self.extent = self._extent(scenario, truth) if self.position else None
+        self._box = self._known_places(scenario, truth) if self.position else None
         self.silent = _silences(scenario)
         first = scenario.beliefs[0]
         self.particles = len(first.log_weights) if isinstance(first, Particles) else 0
@@ -66,8 +66,16 @@ class Layout:
         """Whether the position is in the plane."""
         return self.position is not None and len(place_of(self.space.parts[self.position], np.empty(3))) == 2
 
-    def _extent(self, scenario: Scenario, truth: Array) -> tuple[Array, float]:
-        """The centre (3,) and the half width in m of what is known to be in the scene."""
+    @property
+    def extent(self) -> tuple[Array, float] | None:
+        """The centre (3,) and the half width in m of what is known so far to be in the scene."""
+        if self._box is None:
+            return None
+        low, high = self._box
+        return 0.5 * (low + high), max(0.5, float(0.5 * np.abs(high - low).max()))
+
+    def _known_places(self, scenario: Scenario, truth: Array) -> Array:
+        """The box (2, 3) about the places that are known beforehand."""
         assert self.position
         part, at = self.space.parts[self.position], self.space.at[self.position]
         first = scenario.beliefs[0]
@@ -78,11 +86,26 @@ class Layout:
         seen += [thing.positions for thing in scenario.scenery.values() if isinstance(thing, (Landmarks, Path))]
         seen += [thing.points for thing in scenario.scenery.values() if isinstance(thing, Cloud)]
         points = np.concatenate([flat3(np.asarray(place, float)) for place in seen])
-        low, high = points.min(0), points.max(0)
-        return 0.5 * (low + high), max(0.5, float(0.5 * np.abs(high - low).max()))
+        return np.stack([points.min(0), points.max(0)])
+
+    def _widen(self, batch: Batch) -> None:
+        """Makes room for where steps ended: by their truth, or else by the estimate without its wildest hundredth."""
+        if self._box is None or self.position in self.gapless or not batch.stages or self.matched:
+            return
+        assert self.position
+        part, at = self.space.parts[self.position], self.space.at[self.position]
+        box = self._box
+        for values, wild in ((batch.truth, 0.0), (batch.end_moments[0], 0.01)):
+            place = flat3(place_of(part, values[:, at])) if values.size else np.empty((0, 3))
+            place = place[np.isfinite(place).all(1)]
+            if len(place):
+                low, high = np.quantile(place, [wild, 1 - wild], axis=0)
+                self._box = np.stack([np.minimum(box[0], low), np.maximum(box[1], high)])
+                return
 
     def learn(self, batch: Batch) -> bool:
         """Takes in what is new; True where anything is."""
+        self._widen(batch)
         new = False
         for rows in batch.stages:
             if self._unknown.get(rows.name, True):

@@ -63,7 +63,8 @@ class Recorder:
         self._rows: list[Step] = []
         self._limit = _ROWS[1]  # steps to a batch; the first few tell the size of the others
         self._sized = 0
-        self._viewed: list[str] | None = None
+        self._viewed: list[str] | None = None  # what the view shows, and about how much of the world
+        self._framed = 0.0
         self._places = 0  # taken on the stage timeline
         self._lock = threading.Lock()
         self._failed: Exception | None = None
@@ -128,6 +129,7 @@ class Recorder:
             raise self._failed
         self._properties["result"] = result
         self._properties["facts"] |= facts or {}
+        self._show(1.05)
         self._send_properties()
         self._disconnect()
         os.replace(self.partial, self.path)
@@ -200,14 +202,20 @@ class Recorder:
         self._standing.clear(batch)
         self._plots.add(batch)
         self._pictures.add(batch)
-        if self._viewed != (known := [*self._layout.sensors, *self._layout.stages]):  # the view is built from these
-            self._viewed = known
-            self._stream.send_blueprint(blueprints.build(self._layout))
+        self._show(1.5)
         if error := steps[-1].error:  # a failure is a run's last step
             text = f"step {error.step}, stage {error.stage}: {error.message}"
             last = batch.times.pick(np.array([-1]))
             at = Times(last.step, last.time, np.array([batch.end - 1]))
             send(self._stream, schema.EVENTS, at, rr.TextLog.columns(text=[text], level=["ERROR"]))
+
+    def _show(self, outgrown: float) -> None:
+        """Sends the view, where it is built from other things than the last one, or its frame has been outgrown."""
+        known = [*self._layout.sensors, *self._layout.stages]
+        reach = self._layout.extent[1] if self._layout.extent else 0.0
+        if known != self._viewed or reach > outgrown * self._framed:
+            self._viewed, self._framed = known, reach
+            self._stream.send_blueprint(blueprints.build(self._layout))
 
     def _send_steps(self, batch: Batch) -> None:
         steps = batch.steps

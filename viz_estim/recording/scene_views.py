@@ -81,7 +81,8 @@ def view(scene: str, holders: list[Compared], first: Compared, scenes: Scenes, n
     origin = f"{holders[0].path}{scene}"
     if scene == CANVAS:
         return flat(origin, contents, scenes.sizes.get((scene, holders[0].place)), name)
-    trail: Any = {f"{one.path}{scene}/estimate/trail": [rrb.VisibleTimeRanges(_since_start())] for one in holders}
+    trails = [*(f"{one.path}{scene}/estimate/trail" for one in holders), f"{first.path}{scene}/truth/trail"]
+    trail: Any = {path: [rrb.VisibleTimeRanges(_since_start())] for path in trails}
     return rrb.Spatial3DView(
         origin=origin, contents=contents, name=name, eye_controls=_eye(scene, holders, first, scenes, wide),
         line_grid=False,
