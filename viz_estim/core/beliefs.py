@@ -86,7 +86,7 @@ class Particles:
         """The effective sample size 1/Σw² (*,), from 1 to N (Kong, Liu and Wong 1994)."""
         if self._ess is None:
             # Not by BLAS: for many particles it wakes a thread on each core, which then waits there in a busy loop.
-            squares = np.add.reduce(np.square(self.weights), axis=-1)
+            squares = np.einsum("...i,...i->...", self.weights, self.weights)
             object.__setattr__(self, "_ess", np.asarray(1 / squares))
         assert self._ess is not None
         return self._ess

@@ -70,6 +70,11 @@ def _equal_log_weights(N: int) -> Array:
     return log_weights
 
 
+@lru_cache(maxsize=8)
+def _numbers(count: int) -> np.ndarray:
+    return np.arange(count)
+
+
 @names_its_failures
 def resample(
     belief: Particles,
@@ -90,7 +95,7 @@ def resample(
     if where is not None:
         copies = np.where(where[..., None], copies, 1)
         log_weights = np.where(where[..., None], log_weights, belief.log_weights)
-    chosen = np.repeat(np.arange(copies.size), copies.ravel())
+    chosen = np.repeat(_numbers(copies.size), copies.ravel())
     states = belief.states.reshape(-1, n).take(chosen, axis=0).reshape(belief.states.shape)
     ancestors = (chosen if copies.ndim == 1 else chosen % N).reshape(copies.shape)
     distinct = np.asarray(np.count_nonzero(copies, axis=-1 if copies.ndim > 1 else None), float)

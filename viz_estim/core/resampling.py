@@ -19,8 +19,9 @@ Method = Literal["systematic", "stratified", "residual", "multinomial"]
 
 def systematic(weights: Array, rng: np.random.Generator) -> np.ndarray:
     """One number u for all, points (i + u)/N: ⌊N·w⌋ or ⌈N·w⌉ copies (Kitagawa 1996)."""
-    u = rng.random((*weights.shape[:-1], 1))
-    return _differences(np.ceil(_scaled(weights) - u))
+    below = _scaled(weights)
+    below -= rng.random((*weights.shape[:-1], 1))
+    return _differences(np.ceil(below, out=below))
 
 
 def stratified(weights: Array, rng: np.random.Generator) -> np.ndarray:
@@ -65,9 +66,10 @@ def _scaled(weights: Array) -> Array:
 
 def _differences(below: Array) -> np.ndarray:
     """Copies (*, N) from how many points lie below each cⱼ."""
-    below = below.astype(int)
-    below[..., 1:] -= below[..., :-1].copy()
-    return below
+    copies = np.empty(below.shape, int)
+    copies[..., 0] = below[..., 0]
+    np.subtract(below[..., 1:], below[..., :-1], out=copies[..., 1:], casting="unsafe")  # whole numbers, all of them
+    return copies
 
 
 def _draws(weights: Array, count: Array, rng: np.random.Generator) -> np.ndarray:

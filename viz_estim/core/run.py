@@ -173,10 +173,11 @@ def _own(value: Any) -> Any:
 
 def _finite(values: Array) -> bool:
     """Whether all values are."""
-    # A finite sum of squares has finite terms, and is quicker to see; one that is not may have overflowed. Not of many:
-    # BLAS then wakes a thread on each core, which waits there in a busy loop.
+    # A finite sum has finite terms, and takes no memory to see; one that is not may have overflowed. Of many not by
+    # BLAS, which then wakes a thread on each core that waits there in a busy loop.
     flat = values.ravel()
-    return (flat.size <= 10_000 and isfinite(flat.dot(flat))) or bool(np.isfinite(flat).all())
+    total = flat.dot(flat) if flat.size <= 10_000 else np.add.reduce(flat)
+    return isfinite(total) or bool(np.isfinite(flat).all())
 
 
 def _failing_stage(stages: list[Stage], failure: Exception) -> str:
