@@ -61,6 +61,7 @@ BAD_DATA = {
     "infinite reading": (changed(vals=lambda v: poked(v, np.inf)), "vals is not a number"),
     "NaN stamp": (changed(ts=lambda t: poked(t, np.nan)), "ts is not a number"),
     "stamps that go back": (changed(ts=lambda t: t[:, ::-1]), "ts goes back"),
+    "stamps that stand still": (changed(ts=lambda t: t.astype(np.float32)), "double precision"),
     "empty file": (text("bad.mat", ""), "bad.mat"),
     "no numbers": (text("bad.csv", HEADER + "a,b,c,d,e,f,g\n"), "bad.csv"),
     "a column too few": (text("bad.csv", HEADER.replace(",accel_z", "") + ROWS), "bad.csv"),

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shlex
 import struct
 from collections.abc import Iterable
 from pathlib import Path
@@ -123,6 +124,30 @@ def test_export_holds_what_was_recorded(cli: Cli, recording: Path, tmp_path: Pat
         for table in run.stages.values():
             for name, values in table.values.items():
                 np.testing.assert_array_equal(arrays[f"stages/{table.name}/{name}"], values)
+
+
+def test_a_trajectory_has_the_heading_of_a_planar_robot(cli: Cli, tmp_path: Path) -> None:
+    assert cli("run", "diffdrive-ekf", "--seed", 2, "--set", "data.duration=2", "--out", tmp_path / "a.rrd").code == 0
+    assert cli("export", tmp_path / "a.rrd", "--to", "tum", "-o", tmp_path / "a.tum").code == 0
+    run = viz_estim.load(tmp_path / "a.rrd")
+    for file, states in (("a.tum", run.mean), ("a.truth.tum", run.truth)):
+        tum = np.loadtxt(tmp_path / file)
+        np.testing.assert_allclose(tum[:, 1:4], np.c_[states[:, :2], np.zeros(len(tum))], atol=1e-9)
+        yaw = Rotation.from_quat(tum[:, 4:]).as_rotvec()
+        np.testing.assert_allclose(yaw, states[:, 2:] * [0, 0, 1], atol=1e-8)
+
+
+def test_the_commands_that_are_printed_can_be_pasted(cli: Cli, short: list[str], tmp_path: Path) -> None:
+    folder = tmp_path / "it's my folder"
+    folder.mkdir()
+    a, b = folder / "a run.rrd", folder / "both.rrd"
+    ran = cli("run", "imu-gyro", *short, "--out", a)
+    assert shlex.split(ran.out.splitlines()[-1]) == ["viz-estim", "open", str(a)]
+    told = cli("compare", a, a, "--out", b)
+    assert shlex.split(told.out.splitlines()[-1]) == ["viz-estim", "open", str(b)]
+    last = shlex.split(cli("show", a).out.splitlines()[-1])
+    assert cli(*last[1:]).code == 0
+    assert last[:3] == ["viz-estim", "show", str(a)]
 
 
 def test_simulated_files_calibrate_and_run(cli: Cli, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +135,21 @@ def test_the_still_prefix_and_the_freeze_of_a_simulation_are_found(seed: int) ->
     np.testing.assert_allclose(intervals(data.frozen), [longest], atol=2)
     assert data.time[data.still - 1] == pytest.approx(still, abs=0.3)
     assert not prepare(simulated(seed, duration=9 + still, still=still, freeze=0), None).frozen.any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_gyro_that_is_stuck_at_first_says_nothing_of_its_rest(seed: int) -> None:
+    log = simulated(seed, duration=10, still=4, freeze=0)
+    stuck = log.stamps < log.stamps[0] + 1.5
+    gyro = np.where(stuck[:, None], [382.0, 383.0, 384.0], log.gyro)
+    whole, data = prepare(log, None), prepare(replace(log, gyro=gyro), None)
+    np.testing.assert_array_equal(data.frozen, stuck)
+    assert data.still == pytest.approx(whole.still, abs=3)
+    np.testing.assert_allclose(data.gyro[~stuck], whole.gyro[~stuck], atol=3e-3)
+    # One that gets stuck after half a second has shown its rest before.
+    late = replace(log, gyro=np.where(stuck[:, None] & (log.stamps > log.stamps[0] + 0.8)[:, None], gyro, log.gyro))
+    assert prepare(late, None).stuck == 0
+    np.testing.assert_allclose(prepare(late, None).gyro[~stuck], whole.gyro[~stuck], atol=3e-3)
 
 
 def turning(rate: Array, seconds: float) -> tuple[Array, Array, Array]:

@@ -17,8 +17,11 @@ from conftest import Cli
 
 import viz_estim
 from viz_estim.errors import BadInput
+from viz_estim.files import claimed
 from viz_estim.recording.reader import load
-from viz_estim.recording.rescue import whole
+from viz_estim.recording.recorder import partial_of
+from viz_estim.recording.rescue import last_whole, whole
+from viz_estim.recording.tables import StageTable
 
 FAILING = """
 import numpy as np
@@ -232,3 +235,65 @@ def test_a_file_that_is_no_run_is_one_line(kind: str, cli: Cli, tmp_path: Path) 
         assert done.err.startswith(f"viz-estim: {path}: ")
         assert done.err.count("\n") == 1
     assert sorted(os.listdir(tmp_path)) == ([] if kind == "missing" else ["file.rrd"])
+
+
+def test_a_run_that_was_cut_off_has_whole_steps_alone(cli: Cli, tmp_path: Path) -> None:
+    out, cut = tmp_path / "a.rrd", tmp_path / "cut.rrd"
+    assert cli("run", "underwater-bayes", "--seed", 1, "--out", out).code == 0
+    whole_run, content = load(out), out.read_bytes()
+    lengths = set()
+    for end in np.linspace(0.1, 0.95, 18):
+        cut.write_bytes(content[: int(end * len(content))])
+        if cli("show", cut).code:
+            continue
+        run = load(cut)
+        lengths.add(len(run.step))
+        for step in {int(run.step[0]), int(run.step[-1])}:
+            assert [t.name for t, _ in run.at(step)] == [t.name for t, _ in whole_run.at(step)]
+        for name, values in run.ends.items():
+            np.testing.assert_array_equal(values, whole_run.ends[name][: len(run.step)])
+        assert cli("diagnose", cut).code == 0
+    assert lengths
+
+
+@pytest.mark.parametrize(
+    ("places", "last"),
+    [
+        ([[0, 2, 4], [1, 3, 5]], 2),
+        ([[0, 2, 4], [1, 3]], 2),  # the last step may have had one stage
+        ([[0, 2, 4], [1]], 0),
+        ([[0], [1]], 0),
+        ([[], []], 0),
+    ],
+)
+def test_a_step_that_lacks_a_stage_is_not_whole(places: list[list[int]], last: int) -> None:
+    tables = [
+        StageTable(name, np.arange(len(at)), np.array(at, int), {}, {})
+        for name, at in zip(("predict", "update"), places, strict=True)
+    ]
+    assert last_whole([np.array([0]), np.array([1, 2])], tables) == last
+    assert last_whole([np.array([0, 1, 2])], tables) == (2 if last == 2 else -1)
+
+
+def test_two_runs_do_not_write_one_file(cli: Cli, tmp_path: Path) -> None:
+    out = tmp_path / "a.rrd"
+    with claimed(partial_of(out)):
+        done = cli("run", "underwater-bayes", "--out", out)
+        assert (done.code, done.out) == (2, "")
+        assert done.err.startswith(f"viz-estim: {partial_of(out)}: another run is recording there")
+    assert not out.exists()
+    assert cli("run", "underwater-bayes", "--out", out).code == 0
+    assert not partial_of(out).exists()
+
+
+def test_a_disk_that_is_full_is_one_line(cli: Cli, short: list[str], tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")  # not on every system
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, before[1]))
+    try:
+        done = cli("run", "imu-gyro", *short, "--out", tmp_path / "a.rrd")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert (done.code, done.out) == (2, "")
+    assert "is the disk full?" in done.err
+    assert not (tmp_path / "a.rrd").exists()

@@ -40,6 +40,15 @@ TEXTS = {
 }
 
 
+def test_what_tools_write_for_a_missing_number_is_nan(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("time,left\n" + "".join(f"{i},{word}\n" for i, word in enumerate(["", "NaN", "NA", "n/a", "null"])))
+    assert np.isnan(read_table(path).numbers("left")).all()
+    path.write_text("time,left\n0,-\n")
+    with pytest.raises(BadInput, match="line 2, left: '-' is not a number"):
+        read_table(path).numbers("left")
+
+
 @pytest.mark.parametrize("what", TEXTS)
 def test_a_table_is_read_however_it_is_written(what: str, tmp_path: Path) -> None:
     path = tmp_path / "a.csv"

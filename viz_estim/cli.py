@@ -45,6 +45,8 @@ def main(argv: list[str] | None = None) -> int:
 
         if isinstance(error, ViewerError):
             return _refuse(str(error))
+        if "writer thread" in str(error):  # Rerun's word for a file that takes no more
+            return _refuse("the recording cannot be written any further: is the disk full? Free some, or use --out")
         raise
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ def compare(paths: list[Path], out: Path | None, tol: float) -> tuple[dict[str, 
     notes = "\n".join([*listed, "", comparison_table.markdown(names, table)])
     merged.write(path, compared, result, notes)
     lines = comparison_table.text(names, table, shutil.get_terminal_size((120, 24)).columns)
-    return result, "\n".join([*lines, *verdicts, f"viz-estim open {path}"])
+    return result, "\n".join([*lines, *verdicts, f"viz-estim open {shlex.quote(str(path))}"])
 
 
 def _names(paths: list[Path]) -> list[str]:

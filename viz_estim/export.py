@@ -10,8 +10,8 @@ from typing import IO, Any
 import numpy as np
 
 from viz_estim.core.consistency import nees, nis
-from viz_estim.core.quaternions import Array
-from viz_estim.core.spaces import SE2, SO3, Euclidean, Product
+from viz_estim.core.quaternions import Array, exp
+from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product
 from viz_estim.errors import BadInput
 from viz_estim.files import whole
 from viz_estim.recording.layout import as_product
@@ -42,7 +42,9 @@ def _write_tum(path: Path, run: Run, states: Array) -> Path:
             attitude, posed = x, True
         elif isinstance(part, SE2):
             position[:, :2], posed = x[:, :2], True
-            attitude = np.stack([np.cos(x[:, 2] / 2), 0 * x[:, 2], 0 * x[:, 2], np.sin(x[:, 2] / 2)], axis=1)
+            attitude = exp(x[:, 2:] * [0.0, 0.0, 1.0])
+        elif isinstance(part, SO2) and name == "heading":
+            attitude = exp(x * [0.0, 0.0, 1.0])
         elif isinstance(part, Euclidean) and name == "position":
             position[:, : x.shape[1]], posed = x[:, :3], True
     if not posed:

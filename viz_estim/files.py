@@ -41,6 +41,22 @@ def make_folder(folder: Path) -> None:
 
 
 @contextmanager
+def claimed(path: Path) -> Iterator[None]:
+    """Keeps the file for one run while the context lasts; BadInput where another one is writing it."""
+    try:
+        import fcntl
+    except ImportError:  # not on this system: there, two runs must be told apart by the person who starts them
+        yield
+        return
+    with path.open("ab") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BadInput(f"{path}: another run is recording there; wait for it, or choose another name") from None
+        yield
+
+
+@contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """A name to write to, which becomes `path` when the context ends well and vanishes when it does not."""
     aside = _aside(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -69,7 +70,7 @@ def result_text(result: dict[str, Any]) -> str:
         *figures.lines(result),
     ]
     command = "debug" if result.get("error") else "open"
-    return "\n".join([*lines, f"viz-estim {command} {result['recording']}"])
+    return "\n".join([*lines, f"viz-estim {command} {shlex.quote(result['recording'])}"])
 
 
 def overview(run: Run) -> dict[str, Any]:
@@ -104,7 +105,7 @@ def overview_text(value: dict[str, Any]) -> str:
         f"  state:  {', '.join(f'{k} [{u}]' if u else k for k, u in value['state'].items())}",
         *_origin(value),
         *figures.lines(value | {"error": value["error"] if isinstance(value["error"], dict) else None}),
-        f"viz-estim show {value['recording']} --step {value['last_step']}",
+        f"viz-estim show {shlex.quote(value['recording'])} --step {value['last_step']}",
     ]
     return "\n".join(lines)
 
@@ -233,9 +234,9 @@ def _moves(space: Space, one: dict[str, Any]) -> str:
 def calibration_text(value: dict[str, Any]) -> str:
     lines, scenario = (_constants(value), "imu-ukf") if value["system"] == "imu" else (_noises(value), "diffdrive-ekf")
     if "calibration" in value:
-        lines.append(f"viz-estim run {scenario} --data PATH --calibration {value['calibration']}")
+        lines.append(f"viz-estim run {scenario} --data PATH --calibration {shlex.quote(value['calibration'])}")
     if "recording" in value:
-        lines.append(f"viz-estim open {value['recording']}")
+        lines.append(f"viz-estim open {shlex.quote(value['recording'])}")
     return "\n".join(lines)
 
 

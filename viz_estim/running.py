@@ -20,9 +20,9 @@ from viz_estim.checking import check_scenario
 from viz_estim.core.consistency import Tally
 from viz_estim.core.run import Scenario, Step, run
 from viz_estim.errors import BadInput
-from viz_estim.files import check_writable, make_folder, sha256
+from viz_estim.files import check_writable, claimed, make_folder, sha256
 from viz_estim.parameters import assign, check_seed, nearest, parameters
-from viz_estim.recording.recorder import Recorder
+from viz_estim.recording.recorder import Recorder, partial_of
 from viz_estim.scenarios import SCENARIOS, SYSTEMS
 
 Progress = Callable[[int, int], None]
@@ -234,7 +234,10 @@ def execute(planned: Plan, out: Path | None, *, every: int, live: str | None, pr
         make_folder(path.parent)
     check_writable(path, suffix=".rrd")
     properties = planned.properties(scenario)
-    with Recorder(path, scenario, properties, every=every, live=live) as recorder:
+    with (
+        claimed(partial_of(path)),
+        Recorder(path, scenario, properties, every=every, live=live) as recorder,
+    ):
         result = recorded(run(scenario, planned.seed), scenario, recorder, progress)
     head = {"scenario": planned.source.name, "recording": str(path)}
     return head | {"params": planned.all_params(), "seed": planned.seed} | result

@@ -177,7 +177,7 @@ class Session(Moving):
             scenario = self.branch.parts[-1].scenario
             with Recorder(path, scenario, forking.properties(self.branch.parts)) as recorder:
                 recorded(source.steps(), scenario, recorder, lambda done, total: None)
-        self.say(f"viz-estim debug {path}")
+        self.say(f"viz-estim debug {shlex.quote(str(path))}")
 
     # The end, and help.
 

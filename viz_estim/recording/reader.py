@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from viz_estim.core.spaces import Product, Space
 from viz_estim.errors import BadInput
 from viz_estim.recording import schema
 from viz_estim.recording.layout import as_product
-from viz_estim.recording.rescue import whole
+from viz_estim.recording.rescue import last_whole, whole
 from viz_estim.recording.tables import Gathered, StageTable, ends, fill_in, table_of, work_out
 
 
@@ -165,9 +165,30 @@ def load(path: str | Path, *, points: bool | None = True) -> Run:
     fill_in(tables, fields)
     if kept:
         work_out(tables, space)
-    return Run(
+    found = Run(
         path, facts, space, labels, index["step"], index["time"], steps.column("dt", ()), truth, inputs, tables,
         ends(index["step"], tables, space, labels), error, "result" in facts,
+    )  # fmt: skip
+    if found.complete or error:
+        return found
+    return _until(found, last_whole([times["step"] for times in steps.times], tables.values()))
+
+
+def _until(run: Run, last: int) -> Run:
+    """A run that was cut off, up to its step `last`."""
+    rows = run.step <= last
+    if not rows.any():
+        raise NotARun(f"{run.path}: the run was cut off before its first steps were written")
+    tables = {}
+    for name, table in run.stages.items():
+        kept = table.step <= last
+        if kept.any():
+            values = {quantity: numbers[kept] for quantity, numbers in table.values.items()}
+            tables[name] = replace(table, step=table.step[kept], place=table.place[kept], values=values)
+    return replace(
+        run, step=run.step[rows], time=run.time[rows], dt=run.dt[rows], truth=run.truth[rows], stages=tables,
+        inputs={name: values[rows] for name, values in run.inputs.items()},
+        ends={name: values[rows] for name, values in run.ends.items()},
     )  # fmt: skip
 
 

@@ -8,11 +8,14 @@ import shutil
 import struct
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
+import numpy as np
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
+
+from viz_estim.recording.tables import StageTable
 
 # An .rrd stream is a header of 12 bytes and messages of two little-endian uint64, kind and length, and a payload; where
 # it was ended well, a footer follows, whose last 12 bytes are its mark and the number of its entries.
@@ -43,6 +46,19 @@ def has_rows(path: Path) -> bool:
             return any(not chunk.is_static for chunk in RrdReader(path).stream())
     except (ValueError, OSError, RuntimeError) as error:
         return path.stat().st_size > 0 and "No recording store" not in str(error)
+
+
+def last_whole(batches: list[np.ndarray], tables: Collection[StageTable]) -> int:
+    """The number of the last step whose stages all reached the file; −1 where there is none. batches: the steps (M,) of
+    each batch, in order.
+
+    A batch is written table by table, its steps first, so that a kill may leave some of the last one's stages alone:
+    then the places on the stage timeline, which are counted without a gap, have one, or end before the steps do.
+    """
+    place, step = (np.concatenate([[], *(getattr(table, name) for table in tables)]) for name in ("place", "step"))
+    if len(place) and int(step.max()) == batches[-1][-1] and int(place.max()) == len(place) - 1:
+        return int(batches[-1][-1])
+    return int(batches[-2][-1]) if len(batches) > 1 else -1
 
 
 def _sound_end(path: Path) -> int:

@@ -72,7 +72,7 @@ def by_median(data: ImuData) -> ImuData:
         return data
     per_count = np.ptp(data.gyro, axis=0) / np.ptp(data.log.gyro, axis=0)
     median = np.median(data.log.gyro[: data.still], axis=0)
-    return replace(data, gyro=data.gyro + per_count * (resting_gyro(data.log, data.still) - median))
+    return replace(data, gyro=data.gyro + per_count * (resting_gyro(data.log, data.still, data.stuck) - median))
 
 
 def frozen(data: ImuData) -> ImuData:

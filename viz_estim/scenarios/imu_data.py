@@ -13,7 +13,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.errors import BadInput
 from viz_estim.scenarios import imu_calibration
 from viz_estim.scenarios.imu_files import ImuLog
-from viz_estim.scenarios.imu_health import frozen_gyro, still_prefix
+from viz_estim.scenarios.imu_health import frozen_gyro, still_prefix, stuck_at_first
 
 _TRUTH_GAP = 0.1  # s: across a longer gap the truth is not interpolated
 
@@ -26,7 +26,8 @@ class ImuData:
     """A log in SI units, (T, …) arrays: time s from the first stamp, gyro rad/s, accel m/s² (body x, y, z).
 
     truth (T, 4): quaternions body → world, NaN where there is none; frozen (T,): the gyro is stuck; still: the number
-    of samples from the first on in which the sensor lies still. log: what was read, for the raw counts.
+    of samples from the first on in which the sensor lies still; stuck: in so many of these, from the first on, the gyro
+    is stuck. log: what was read, for the raw counts.
     """
 
     time: Array
@@ -35,6 +36,7 @@ class ImuData:
     truth: Array
     frozen: np.ndarray
     still: int
+    stuck: int
     log: ImuLog
     notes: str
 
@@ -50,15 +52,16 @@ def prepare(log: ImuLog, calibration: Path | None) -> ImuData:
         constants = imu_calibration.DOCUMENTED if calibration is None else imu_calibration.load(calibration)
         offset = constants.truth_offset(log.files)
         accel = constants.accel(log.accel)
-        still = still_prefix(log.stamps, constants.gyro(log.gyro), accel)
+        rates = constants.gyro(log.gyro)
+        still, stuck = (find(log.stamps, rates, accel) for find in (still_prefix, stuck_at_first))
         if still:
-            constants = constants.with_gyro_bias(resting_gyro(log, still))
+            constants = constants.with_gyro_bias(resting_gyro(log, still, stuck))
         gyro = constants.gyro(log.gyro)
     else:
         if calibration is not None:
             raise BadInput(f"{log.files[0]}: is in SI units; a calibration is for counts (.mat), leave it out")
-        still = still_prefix(log.stamps, log.gyro, log.accel)
-        gyro = log.gyro - resting_gyro(log, still) if still else log.gyro
+        still, stuck = (find(log.stamps, log.gyro, log.accel) for find in (still_prefix, stuck_at_first))
+        gyro = log.gyro - resting_gyro(log, still, stuck) if still else log.gyro
         accel = log.accel
     frozen = frozen_gyro(log.stamps, gyro, accel, np.zeros(3))
     truth = truth_at(log.stamps, log, offset)
@@ -66,17 +69,18 @@ def prepare(log: ImuLog, calibration: Path | None) -> ImuData:
     notes = _describe(time, truth, frozen, still)
     if offset:
         notes += f" The truth's stamps are {1e3 * offset:.0f} ms late, by the calibration, and corrected."
-    return ImuData(time, gyro, accel, truth, frozen, still, log, notes)
+    return ImuData(time, gyro, accel, truth, frozen, still, stuck, log, notes)
 
 
-def resting_gyro(log: ImuLog, still: int) -> Array:
-    """What the gyro (3,) reads at rest: its mean over the still prefix, but for the end, when a hand takes hold.
+def resting_gyro(log: ImuLog, still: int, stuck: int = 0) -> Array:
+    """What the gyro (3,) reads at rest: its mean over the still prefix, but for the end, when a hand takes hold, and
+    for the samples at the beginning in which it was stuck.
 
     The mean, not the median: counts are whole numbers, and the median's error of up to half a count is 10° after half
     a minute.
     """
-    end = log.stamps[still - 1]
-    untouched = log.stamps <= max(end - _HANDS_ON, 0.5 * (log.stamps[0] + end))
+    begin, end = log.stamps[stuck], log.stamps[still - 1]
+    untouched = (log.stamps >= begin) & (log.stamps <= max(end - _HANDS_ON, 0.5 * (begin + end)))
     mean: Array = log.gyro[untouched].mean(0)
     return mean
 

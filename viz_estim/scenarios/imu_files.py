@@ -205,6 +205,8 @@ def _imu_stamps(stamps: Array, path: Path, name: str) -> Array:
     _in_order(stamps, path, name)
     if (spacing := float(np.median(np.diff(stamps)))) > _SLOWEST:
         raise BadInput(f"{path}: {name} has {spacing:g} s between samples, which is no IMU's; give seconds")
+    if spacing == 0:  # single precision resolves Unix seconds to 128 s
+        raise BadInput(f"{path}: {name} stands still at most samples; save it in double precision, in seconds")
     return stamps
 
 

@@ -144,7 +144,7 @@ def fit(logs: list[ImuLog]) -> Fit:
         residuals["gyro_deg"][stage] = _summary([np.degrees(one.turn_error(c, o)) for one, c, o in pairs])
     shares = []
     for log, one, offset, error in zip(logs, sets, offsets, gyro_se[2], strict=True):
-        still = resting_gyro(log, one.data.still).tolist() if one.data.still else None
+        still = resting_gyro(log, one.data.still, one.data.stuck).tolist() if one.data.still else None
         frozen, unseen = int(one.data.frozen.sum()), int(np.isnan(one.gravity(offset)[:, 0]).sum())
         counts = (len(log.stamps), frozen, unseen, len(one.begin))
         shares.append(SetFit(log, float(offset), float(error), *counts, still))
@@ -173,7 +173,7 @@ class _Set:
         if len(log.truth_stamps) < 2:
             raise BadInput(f"{_name(log)}: no motion capture; give its viconRot*.mat too, or put it beside")
         data = prepare(log, None)
-        bias = resting_gyro(log, data.still) if data.still else DOCUMENTED.gyro_bias
+        bias = resting_gyro(log, data.still, data.stuck) if data.still else DOCUMENTED.gyro_bias
         near = replace(log, stamps=data.time, truth_stamps=evened(log.truth_stamps - log.stamps[0]))
         # The offset is not known yet: the truth must be there over all that it may be.
         shifts = (-_LARGEST_OFFSET, 0.0, _LARGEST_OFFSET)

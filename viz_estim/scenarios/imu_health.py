@@ -26,8 +26,34 @@ def still_prefix(stamps: Array, gyro: Array, accel: Array) -> int:
     """The number of samples from the first on in which the sensor lies still; 0 where it moves from the start.
 
     gyro (T, 3) rad/s and accel (T, 3) m/s². The first half second is the baseline; motion begins where the mean over
-    0.1 s leaves it by more than noise can, and is dated back by half that window.
+    0.1 s leaves it by more than noise can, and is dated back by half that window. A gyro that is stuck at first
+    (`stuck_at_first`) gives its baseline after that.
     """
+    stuck = stuck_at_first(stamps, gyro, accel)
+    return stuck + _still(stamps[stuck:], gyro[stuck:], accel[stuck:])
+
+
+def stuck_at_first(stamps: Array, gyro: Array, accel: Array) -> int:
+    """The number of samples from the first on in which the gyro is stuck while the sensor lies still; mostly 0.
+
+    gyro (T, 3) rad/s, accel (T, 3) m/s². Nothing turns that it could miss, but it jumps to its level at rest, in one
+    sample, while the accelerometer goes on as before. Of the two levels the one nearer to 0 is that at rest.
+    """
+    begin, end = next(iter(flat_runs(stamps, gyro)), (1, 1))
+    if begin > 0 or not _still(stamps[end:], gyro[end:], accel[end:]):
+        return 0
+    upto = int(np.searchsorted(stamps, stamps[end] + _BASELINE))
+    stuck, rest = gyro[:end].mean(0), gyro[end:upto].mean(0)
+    quiet = accel[end:upto].std(0) + accel[:end].std(0)
+    moved = np.abs(accel[:end].mean(0) - accel[end:upto].mean(0)) > np.maximum(_STILL[1], quiet)
+    jumped = float(np.linalg.norm(stuck - rest)) > _STILL[0] and np.linalg.norm(stuck) > np.linalg.norm(rest)
+    return end if jumped and not moved.any() and quiet.max() < 2 * _STEADY[1] else 0
+
+
+def _still(stamps: Array, gyro: Array, accel: Array) -> int:
+    """`still_prefix` of a gyro that is not stuck at first."""
+    if len(stamps) < 2:
+        return 0
     n = int(np.searchsorted(stamps, stamps[0] + _BASELINE))
     if n < 5 or n >= len(stamps):
         return 0
@@ -50,9 +76,10 @@ def frozen_gyro(stamps: Array, gyro: Array, accel: Array, bias: Array) -> np.nda
 
     gyro (T, 3) rad/s as read and bias (3,) its reading at rest; accel (T, 3) m/s². A stuck gyro still flickers by one
     quantum, and so does one that rests; what tells them apart is the accelerometer: gravity's direction turns by more
-    than the stuck rates account for.
+    than the stuck rates account for, or lies still throughout (`stuck_at_first`).
     """
     frozen = np.zeros(len(stamps), bool)
+    frozen[: stuck_at_first(stamps, gyro - bias, accel)] = True
     quantum = np.array([_quantum(channel) for channel in gyro.T])
     for first, end in flat_runs(stamps, gyro):
         rate = gyro[first:end].mean(0) - bias

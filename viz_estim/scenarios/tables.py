@@ -20,6 +20,7 @@ from viz_estim.errors import BadInput
 from viz_estim.scenarios.reading import unreadable
 
 _SEPARATORS = (";", ",", "\t", None)  # None: blanks. A comma beside semicolons is a decimal one
+_MISSING = ("", "na", "n/a", "null")  # what tools write for a number that is not there
 _UNIT = re.compile(r"\s*[\[(]\s*([^\])]*?)\s*[\])]")
 _FOREIGN = re.compile(r"deg|°|dps|\b[mµuk]?g\b|^([mµun]s|min|h)$|\b[mck]m\b", re.IGNORECASE)  # not SI, nor radians
 
@@ -60,7 +61,7 @@ class Table:
         return found if isinstance(found, list) else [str(value) for value in found.ravel()]
 
     def numbers(self, name: str) -> Array:
-        """A column (N,); an empty cell is NaN. BadInput where one is no number, or not in SI units and radians."""
+        """A column (N,); an empty cell or `NA` is NaN. BadInput where one is no number, or not in SI units, radians."""
         found, unit = self._cells(name), self.units[self.names.index(name)]
         if _FOREIGN.search(unit):
             raise BadInput(f"{self.path}: {name} is in {unit}; convert it to SI units and radians")
@@ -71,7 +72,7 @@ class Table:
         out = np.empty(len(found))
         for row, cell in enumerate(found):
             try:
-                out[row] = float(cell) if cell else np.nan
+                out[row] = np.nan if cell.lower() in _MISSING else float(cell)
             except ValueError:
                 raise BadInput(f"{self.path}: {self.where(row)}, {name}: {cell[:40]!r} is not a number") from None
         return out
