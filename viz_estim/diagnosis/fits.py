@@ -58,7 +58,7 @@ def white(one: Against, values: Array) -> Array:
     """L⁻¹·v of values (M, m) or (M, m, k), R = L·Lᵀ."""
     flat = values.ndim == 2
     solved = np.linalg.solve(np.linalg.cholesky(one.noise), values[..., None] if flat else values)
-    return np.asarray(solved[..., 0] if flat else solved)
+    return np.asarray(solved[..., 0] if flat else solved, float)
 
 
 class Fitted(NamedTuple):

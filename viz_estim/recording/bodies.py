@@ -214,4 +214,5 @@ def xyzw(q: Array) -> Array:
 def tips(q: Array) -> Array:
     """The tips (*, 3, 3) of the body's x, y and z axes in the world, for quaternions (*, 4), as they are drawn."""
     # Its columns, as rows: the inverse turn's.
-    return quaternions.to_matrix(np.asarray(quaternions.conjugate(q), np.float32))
+    turned: Any = np.asarray(quaternions.conjugate(q), np.float32)
+    return quaternions.to_matrix(turned)
