@@ -18,7 +18,7 @@ from viz_estim.scenarios import SCENARIOS
 pytestmark = pytest.mark.draws
 
 STEP = 300  # while it turns, and the gyro is alive
-SIZE = (900, 880)  # drawn without a graphics card, every pixel costs
+SIZE = (840, 800)  # drawn without a graphics card, every pixel costs
 WORLD_AND_SENSOR = ("/attitude", "/sensors/accel")  # where two views look
 BRIEF = [*SHORT, "data.steps=60", "data.points=1500", "particles=400", "by=imu-gyro"]
 

@@ -300,7 +300,7 @@ def test_it_draws(cli: Cli, tmp_path: Path) -> None:
             rec.stage("predict", mean=x, cov=P)
             rec.stage("update", mean=x, cov=P, residual=[0.1, -0.1], residual_cov=np.eye(2), sensor="gps")
             rec.step(time=k, truth=x + 0.1 if k > 5 else [np.nan] * 3)
-    done = cli("snapshot", tmp_path / "a.rrd", "--step", 20, "--size", "800x600", "-o", tmp_path / "a.png")
+    done = cli("snapshot", tmp_path / "a.rrd", "--step", 20, "--size", "500x400", "-o", tmp_path / "a.png")
     assert (done.code, done.err) == (0, "")
     run = viz_estim.load(tmp_path / "a.rrd")
     assert np.isnan(run.truth[:6]).all()

@@ -167,7 +167,7 @@ def test_every_command_reads_what_a_kill_left(killed: Killed, cli: Cli, tmp_path
         assert cli("export", killed.partial, "--to", kind, "-o", tmp_path / f"out.{kind}").code == 0
     with np.load(tmp_path / "out.npz") as arrays:
         assert arrays["step"][-1] == overview["last_step"]
-    taken = cli("snapshot", killed.partial, "--step", killed.ended, "--size", "800x600", "-o", tmp_path / "a.png")
+    taken = cli("snapshot", killed.partial, "--step", killed.ended, "--size", "500x400", "-o", tmp_path / "a.png")
     assert (taken.code, taken.err) == (0, "")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 

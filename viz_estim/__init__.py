@@ -52,7 +52,8 @@ def estimate_rot(
 
     file = imu_files.of_course(imu_file)
     data = imu_data.prepare(imu_files.load(file, None), None if calibration is None else Path(calibration))
-    scenario = imu.imu_ukf(data, **({"frozen": "reject"} | params))
+    chosen: dict[str, Any] = {"frozen": "reject"} | params
+    scenario = imu.imu_ukf(data, **chosen)
     attitudes = []
     for step in run(scenario):
         if step.error:

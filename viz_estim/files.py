@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -41,7 +41,7 @@ def make_folder(folder: Path) -> None:
 
 
 @contextmanager
-def claimed(path: Path) -> Iterator[None]:
+def claimed(path: Path) -> Generator[None]:
     """Keeps the file for one run while the context lasts; BadInput where another one is writing it."""
     try:
         import fcntl
@@ -57,7 +57,7 @@ def claimed(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def whole(path: Path) -> Generator[Path]:
     """A name to write to, which becomes `path` when the context ends well and vanishes when it does not."""
     aside = _aside(path)
     try:

@@ -235,7 +235,7 @@ class Tally:
 
     def summary(self) -> dict[str, Any]:
         """The run's `summary`."""
-        innovations = [
+        innovations: list[Any] = [
             (rows[0].space, *(np.stack([getattr(row, k) for row in rows]) for k in ("residual", "cov", "offered")))
             for rows in self.innovations.values()
         ]

@@ -53,7 +53,7 @@ def evaluate(tree: ast.expr, lookup: Lookup) -> Array:
             return _value(tree, lookup)
     except BadExpression:
         raise
-    except (ArithmeticError, ValueError, TypeError, IndexError, np.linalg.LinAlgError) as error:
+    except (ArithmeticError, ValueError, TypeError, IndexError) as error:
         raise BadExpression(f"{_shown(tree)}: {' '.join(str(error).split())}") from error
     except (RecursionError, MemoryError) as error:
         raise BadExpression("the expression asks for too much") from error

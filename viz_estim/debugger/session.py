@@ -6,7 +6,7 @@ import contextlib
 import shlex
 import shutil
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
@@ -216,8 +216,8 @@ class Session(Moving):
             return []
         return [f"{name}=" for name in self.branch.parts[-1].plan.params if name.startswith(text)]
 
-    def complete_help(self, text: str, *ignored: object) -> list[str]:
-        return self.completenames(text)
+    def complete_help(self, *typed: Any) -> list[str]:
+        return self.completenames(*typed)
 
 
 def debug(

@@ -79,7 +79,7 @@ def by_part(case: Case) -> Iterator[Finding]:
     for name, steps, white in found:
         T, dof = white.shape
         mean = float((white**2).sum() / T)
-        independent = max(1.0, T / (2 * _correlation_time(white)))
+        independent = max(1.0, T / (2 * _correlation_time(np.asarray(white, float))))
         total = mean * independent
         p = 2 * min(chi2.sf(total, dof * independent), chi2.cdf(total, dof * independent))
         ratio = mean / dof

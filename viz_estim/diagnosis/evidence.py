@@ -54,7 +54,7 @@ class Readings:
     @cached_property
     def white(self) -> Array:
         """L⁻¹·ν (M, m), S = L·Lᵀ: independent and N(0, 1) if the filter is right."""
-        return np.linalg.solve(np.linalg.cholesky(self.cov), self.residual[..., None])[..., 0]
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(self.cov), self.residual[..., None])[..., 0], float)
 
     @cached_property
     def scaled(self) -> Array:

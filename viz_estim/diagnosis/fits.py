@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +15,8 @@ from viz_estim.core.spaces import Space
 STRETCHES = 20
 
 
-class Against(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Against:
     """A sensor's M readings against the truth: z (M, n), what the truth would give (M, n), r (M, m), R (M, m, m).
 
     foreseen (M, m) is the variance of the truth's reading by the filter's prediction, (H·P·Hᵀ)ᵢᵢ; slip (M,) bounds the
@@ -41,7 +44,13 @@ class Against(NamedTuple):
 
     def pick(self, rows: slice | np.ndarray) -> Against:
         """Some of the readings."""
-        return Against(*(v[rows] if isinstance(v, np.ndarray) else v for v in self))  # type: ignore[arg-type]
+        arrays = {f.name: v for f in fields(self) if isinstance(v := getattr(self, f.name), np.ndarray)}
+        return replace(self, **{name: v[rows] for name, v in arrays.items()})
+
+    @cached_property
+    def whitening(self) -> Array:
+        """L⁻¹ (M, m, m), R = L·Lᵀ: some sixty causes are held against the same noise."""
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.noise)), float)
 
     @property
     def label(self) -> str:
@@ -56,9 +65,7 @@ class Against(NamedTuple):
 
 def white(one: Against, values: Array) -> Array:
     """L⁻¹·v of values (M, m) or (M, m, k), R = L·Lᵀ."""
-    flat = values.ndim == 2
-    solved = np.linalg.solve(np.linalg.cholesky(one.noise), values[..., None] if flat else values)
-    return np.asarray(solved[..., 0] if flat else solved)
+    return (one.whitening @ values[..., None])[..., 0] if values.ndim == 2 else one.whitening @ values
 
 
 class Fitted(NamedTuple):

@@ -23,7 +23,7 @@ from viz_estim.recording.tables import StageTable
 
 _EXACT = 1e-4  # of the log-likelihoods' own standard deviation
 _STEPS, _PARTICLES = 12, 80  # that the model is fitted to
-_STARTS = 24
+_STARTS, _ROUNDS = 24, 60
 
 
 def by_particles(case: Case, attitude: Array | None) -> Iterator[Against]:
@@ -107,14 +107,28 @@ def _of_distances(p: Array, logs: Array, z: Array, truth: Array) -> tuple[Array,
     if not y.std() > 0:
         return None
 
+    def taken(numbers: Array) -> tuple[Array, Array, Array]:
+        """Precisions (s,), and of each distance what is read beyond it (M, N, s) and where from (M, N, s, d)."""
+        away = p[..., None, :] - numbers[: s * d].reshape(s, d)
+        distance = np.linalg.norm(away, axis=-1)
+        off = z[:, None, :] - distance
+        return np.exp(numbers[s * d :]), off, away / np.maximum(distance, 1e-300)[..., None]
+
     def missed(numbers: Array) -> Array:
-        L, precision = numbers[: s * d].reshape(s, d), np.exp(numbers[s * d :])
-        off = z[:, None, :] - np.linalg.norm(p[..., None, :] - L, axis=-1)
+        precision, off, _ = taken(numbers)
         made = -0.5 * (off**2 @ precision)
         return np.asarray(((made - made.mean(1, keepdims=True) - y) / y.std()).ravel())
 
+    def slopes(numbers: Array) -> Array:
+        """The derivatives of what is missed."""
+        precision, off, direction = taken(numbers)
+        by_place = -(precision * off)[..., None] * direction
+        made = np.concatenate([by_place.reshape(*off.shape[:2], s * d), -0.5 * precision * off**2], axis=-1)
+        return np.asarray(((made - made.mean(1, keepdims=True)) / y.std()).reshape(-1, s * (d + 1)))
+
     for places in islice(_starts(truth, z, steps), _STARTS):
-        fit = least_squares(missed, np.concatenate([places.ravel(), np.zeros(s)]), method="lm", max_nfev=400)
+        start = np.concatenate([places.ravel(), np.zeros(s)])
+        fit = least_squares(missed, start, slopes, method="lm", max_nfev=_ROUNDS)
         if np.sqrt(np.mean(fit.fun**2)) < _EXACT:
             return fit.x[: s * d].reshape(s, d), np.exp(-fit.x[s * d :])
     return None

@@ -179,7 +179,7 @@ def far(case: Case) -> Iterator[Finding]:
             continue
         best = np.nan_to_num(table.values["log_likelihoods"], nan=-np.inf).max(axis=1)
         row = np.searchsorted(run.step, table.step)
-        m = sum(np.isfinite(run.inputs[name][row]).sum(1) for name in inputs)
+        m = np.sum([np.isfinite(run.inputs[name][row]).sum(1) for name in inputs], axis=0)
         rows = np.isfinite(best) & (m > 0) & (table.step >= case.first)
         if rows.sum() < 5:
             continue

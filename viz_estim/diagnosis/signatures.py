@@ -221,8 +221,8 @@ class _Update:
         self.inverse[ok] = np.linalg.solve(S[ok], np.broadcast_to(np.eye(m), S[ok].shape))
         self.offered: np.ndarray = get["innovation.offered"] > 0
         whole = self.offered.all(1)
-        known = {int(step) for readings in case.sensors.values() for step in readings.step}
-        self.counts: np.ndarray = whole & np.array([int(step) in known for step in table.step], bool)
+        known = [readings.step for readings in case.sensors.values()]
+        self.counts: np.ndarray = whole & np.isin(table.step, np.concatenate(known) if known else [])
 
     def prepare(self, column: dict[tuple[str, str], int], q: int) -> None:
         predicted = self.table.values["innovation.predicted"]

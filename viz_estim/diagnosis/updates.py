@@ -211,7 +211,7 @@ def _ratios(A: Array, B: Array) -> tuple[Array, Array]:
     """The smallest and the largest eigenvalue (M,) of B⁻¹·A, symmetric matrices."""
     values, vectors = np.linalg.eigh(symmetrised(B))
     root = vectors / np.sqrt(np.maximum(values, 1e-300))[:, None, :]
-    found = np.linalg.eigvalsh(np.swapaxes(root, 1, 2) @ symmetrised(A) @ root)
+    found = np.asarray(np.linalg.eigvalsh(np.swapaxes(root, 1, 2) @ symmetrised(A) @ root), float)
     return found[:, 0], found[:, -1]
 
 

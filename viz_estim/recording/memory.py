@@ -70,7 +70,7 @@ def _inputs(rows: list[Step]) -> dict[str, Array]:
 def _stacked(values: list[Any]) -> Array:
     """Values of one shape, NaN where one is absent."""
     absent = np.full(np.shape(next(v for v in values if v is not None)), np.nan)
-    return np.stack([absent if v is None else np.asarray(v, float) for v in values])
+    return np.array([absent if v is None else v for v in values], float)
 
 
 def _table(name: str, found: list[tuple[int, int, Stage]]) -> StageTable:
@@ -88,12 +88,12 @@ def _table(name: str, found: list[tuple[int, int, Stage]]) -> StageTable:
         elif isinstance(of[0], Innovation):
             spaces[field] = of[0].space
             for part in Innovation.__slots__[1:]:
-                values[f"{field}.{part}"] = np.stack([np.asarray(getattr(one, part), float) for one in of])
+                values[f"{field}.{part}"] = np.array([getattr(one, part) for one in of], float)
         elif isinstance(of[0], Matches):
             for part in Matches.__slots__:
                 values[f"{field}.{part}"] = _ragged([getattr(one, part) for one in of])
         elif isinstance(of[0], (np.ndarray, float, int)):
-            values[field] = np.stack([np.asarray(one, float) for one in of])
+            values[field] = np.array(of, float)
     return StageTable(name, np.array(index), np.array(places), values, spaces)
 
 

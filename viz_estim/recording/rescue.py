@@ -8,7 +8,7 @@ import shutil
 import struct
 import tempfile
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Generator
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ _MAGIC, _HEADER, _MESSAGE, _MARK, _MARKED = b"RRF2", 12, struct.Struct("<QQ"), b
 
 
 @contextlib.contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def whole(path: Path) -> Generator[Path]:
     """The recording itself, or for the time of the context a copy of it up to its last whole message."""
     end = _sound_end(path)
     if end == path.stat().st_size:

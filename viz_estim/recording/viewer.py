@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
-import rerun_cli  # type: ignore[import-untyped]
+import rerun_cli
 from rerun.experimental import ViewerClient, ViewerState
 
 from viz_estim.recording import links
@@ -52,7 +52,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
         self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=environment, **streams)
         # Were we killed, nobody would call close: the guard ends the viewer when our end of its pipe goes away.
         guard = ["/bin/sh", "-c", 'read line || kill -s KILL -- "-$0"', str(self._process.pid)]
-        self._guard = subprocess.Popen(guard, stdin=subprocess.PIPE, **streams)
+        self._guard: subprocess.Popen[bytes] = subprocess.Popen(guard, stdin=subprocess.PIPE, **streams)
         for _ in polls(ANSWER_S):
             if (found := re.search(ready, self._printed())) or not self.alive:
                 break

@@ -179,7 +179,7 @@ def _load_truth(path: Path) -> tuple[Array, Array]:
         raise BadInput(f"{path}: `ts` has {len(stamps)} stamps and `rots` {rots.shape[2]} frames; they must agree")
     matrices = np.moveaxis(rots, -1, 0)
     # Lost frames come as NaN or as anything that is no rotation.
-    good = np.isfinite(matrices).all((1, 2))
+    good = np.asarray(np.isfinite(matrices).all((1, 2)))
     good[good] = np.abs(matrices[good] @ np.swapaxes(matrices[good], 1, 2) - np.eye(3)).max((1, 2)) < 0.05
     good[good] = np.linalg.det(matrices[good]) > 0
     q = np.full((len(stamps), 4), np.nan)

@@ -162,7 +162,8 @@ def _transition(dt: float) -> Array:
 
 def _process_noise(dt: float, accel_noise: float) -> Array:
     """Q (4, 4) of white acceleration (Bar-Shalom et al. 2001, eq. 6.2.2-4)."""
-    return accel_noise**2 * np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(2))
+    along: Array = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    return np.asarray(accel_noise**2 * np.kron(along, np.eye(2)), float)
 
 
 def _starts(

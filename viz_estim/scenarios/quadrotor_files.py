@@ -129,7 +129,7 @@ def load_flight(path: Path) -> Flight:
 def _imu(fields: dict[str, Any], path: Path) -> tuple[Array, Array, Array]:
     """Stamps (T,), gyro and accel (T, 3) of the rows of `data` that have both."""
     name = next((name for name in fields if name.lower() == "data"), None)
-    rows = fields[name].ravel() if name else np.empty(0)
+    rows: np.ndarray = fields[name].ravel() if name else np.empty(0)
     held = rows.dtype.names or ()
     found = [next((k for k in held if k.lower() in spellings), None) for spellings in _IMU.values()]
     missing = [key for key, spelled in zip(_IMU, found, strict=True) if spelled is None]
