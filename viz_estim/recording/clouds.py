@@ -193,8 +193,8 @@ def _thinned(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
         elif _equal(weights):
             chosen = _evenly(len(weights))
             if isinstance(stage, Resample) and thin:
-                states = thin[-1].belief.states
-                states = states if np.array_equal(states, stage.belief.states[chosen]) else None
+                same: Array = thin[-1].belief.states
+                states = same if np.array_equal(same, stage.belief.states[chosen]) else None
         else:
             total = np.cumsum(np.exp(weights.astype(np.float32)), dtype=float)  # as near as a choice needs it
             chosen = np.searchsorted(total, (np.arange(KEPT) + 0.5) / KEPT * total[-1])
