@@ -10,7 +10,9 @@ import numpy as np
 
 from viz_estim.diagnosis import (
     confidence,
+    copies,
     covariance,
+    durations,
     errors,
     gates,
     geometry,
@@ -39,6 +41,7 @@ OF_SENSORS: tuple[Callable[[Run], Iterator[Finding]], ...] = (
     sensors.frozen,
     sensors.silent,
     repeats.used_twice,
+    repeats.one_for_two,
     sensors.biased_at_rest,
     stamps.stamps,
 )
@@ -64,6 +67,9 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     geometry.wraps,
     geometry.quaternion_norms,
     geometry.units_or_axes,
+    durations.carried,
+    copies.together,
+    copies.weighed_again,
     particles.collapsed,
     particles.clamped,
     particles.far,

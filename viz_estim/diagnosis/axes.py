@@ -16,7 +16,8 @@ _AXES, _UNIT = 0.5, 0.8  # of the misfit, for a map to be named: a unit is off b
 UNITS = {  # by what a sensor reads: the factor that brings a reading to what was expected
     "rad": {"degrees for radians": np.pi / 180, "radians for degrees": 180 / np.pi},
     "m/s²": {"g for m/s²": GRAVITY, "m/s² for g": 1 / GRAVITY},
-    "m/s": {"km/h for m/s": 1 / 3.6, "m/s for km/h": 3.6, "feet for m": 0.3048, "mm for m": 1e-3, "m for mm": 1e3},
+    "m/s": {"km/h for m/s": 1 / 3.6, "m/s for km/h": 3.6, "feet for m": 0.3048, "m for feet": 1 / 0.3048,
+            "mm for m": 1e-3, "m for mm": 1e3},
     "m": {"mm for m": 1e-3, "m for mm": 1e3, "cm for m": 1e-2, "feet for m": 0.3048, "m for feet": 1 / 0.3048},
 }
 

@@ -12,13 +12,13 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean
-from viz_estim.diagnosis.axes import explains, maps, units
+from viz_estim.diagnosis.axes import explains, maps
 from viz_estim.diagnosis.finding import GROSS
 from viz_estim.diagnosis.fits import Against, Fitted, fitted, white
+from viz_estim.diagnosis.naming import named, of_reading
 
 _SPAN = 0.1  # s over which a rate is taken at least: noise of the truth would hide it in a shorter one
 _SQUARE = "squares"
-_NEAR = 0.1  # a factor is that of a known unit, or −1, within a tenth
 
 
 class Cause(NamedTuple):
@@ -180,19 +180,9 @@ def scaled(one: Against) -> Iterator[Cause]:
         "units_or_axes", fit.gain, 1, float(fit.p[0]), fit.p_beyond(0, foreseen / max(unit_size, 1e-300)),
         abs(factor - 1) * unit_size, fit.explained, {"map": f"a factor of {factor:.4g}", "factor": factor},
         f"readings of {one.label} are {factor:.4g}× what the truth would give: "
-        f"{named(factor, one.space.axis_units[0])}",
+        f"{named(factor, of_reading(one.space.axis_units[0]), float(fit.error[0]))}",
         f"divide the readings of {one.label} by {factor:.4g}, or calibrate its scale",
     )  # fmt: skip
-
-
-def named(factor: float, unit: str) -> str:
-    """What a factor of a reading may come from."""
-    if abs(factor / 2 - 1) < _NEAR:
-        return "twice, as a round trip taken for the way there"
-    known = [title for title, value in units(unit).items() if abs(factor * value - 1) < _NEAR]
-    if known:
-        return known[0]
-    return "a sign" if abs(factor + 1) < _NEAR else "a scale factor that is not 1"
 
 
 def _std(one: Against) -> Array:

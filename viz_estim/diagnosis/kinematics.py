@@ -12,14 +12,13 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3
 from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import Finding, judge, level
+from viz_estim.diagnosis.finding import SHEET, Finding, judge, level
 from viz_estim.diagnosis.fits import STRETCHES
 from viz_estim.diagnosis.sensors import Imu, imu
 from viz_estim.scenarios.imu_health import GRAVITY
 
 _WINDOW = 0.1  # s over which gravity's turn is compared with the gyro's
 _DEPENDENT = 4  # windows that share one push of the hand
-_SHEET = 0.05  # of a sensitivity
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -103,7 +102,7 @@ def _slopes(X: Array, change: Array) -> list[tuple[float, float]]:
     parts = np.array([part.sum(0) for part in np.array_split(scores, STRETCHES)])
     robust = inverse @ (parts.T @ parts) @ inverse * STRETCHES / (STRETCHES - 1)
     error = np.sqrt(np.maximum(np.diag(robust), np.finfo(float).tiny))
-    p = 2 * t.sf(np.maximum(np.abs(s - 1) - _SHEET, 0) / error, STRETCHES - 1)
+    p = 2 * t.sf(np.maximum(np.abs(s - 1) - SHEET, 0) / error, STRETCHES - 1)
     return list(zip(s.tolist(), p.tolist(), strict=True))
 
 

@@ -15,13 +15,13 @@ from viz_estim.diagnosis import clouds
 from viz_estim.diagnosis.against import FEWEST
 from viz_estim.diagnosis.against import slip as bound
 from viz_estim.diagnosis.axes import maps
-from viz_estim.diagnosis.causes import named
+from viz_estim.diagnosis.durations import composed, whole
 from viz_estim.diagnosis.evidence import Case, transitions
-from viz_estim.diagnosis.finding import GROSS, Finding, judge
+from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, Finding, judge
 from viz_estim.diagnosis.fits import STRETCHES
+from viz_estim.diagnosis.naming import likeliest, named, of_motion
 
 SURELY = 0.95  # of the misfit explained: no error of a linearisation looks like that
-_SHEET = 0.05  # of a motion: what the data sheet of a wheel or a gyro leaves to a calibration
 _WORLD = "the world's axes"
 _ALIKE = 1.01  # of the squares that are left: as well explained
 
@@ -52,11 +52,12 @@ def prediction(case: Case) -> Iterator[Finding]:
         yield from map(_by_estimate, _elsewhere(case))
         return
     (table, F), row = moves[0], {int(step): k for k, step in enumerate(run.step)}
-    before, _ = case.sequence.before(table)
-    at = np.array([row[int(step)] for step in table.step])
-    ok = (at > 0) & (table.step > case.first)
+    by = whole(case, table)
+    before, step, F = by.before, by.step, composed(F, by)
+    at = np.array([row[int(k)] for k in step])
+    ok = (at > 0) & (step > case.first)
     now, past = run.truth[at], run.truth[np.maximum(at - 1, 0)]
-    error, after = case.space.minus(past, before), case.space.minus(now, table.mean)
+    error, after = case.space.minus(past, before), case.space.minus(now, by.after)
     needed = np.asarray((np.abs(np.nan_to_num(F)) > 1e-12).any(0))
     d = len(case.space.axes)
     told_of: list[tuple[float, Finding]] = []
@@ -75,11 +76,11 @@ def prediction(case: Case) -> Iterator[Finding]:
         slip = bound(F[known][:, i : i + 1], np.nan_to_num(error[known]), before[known], case.space)
         near = np.isfinite(slip) & (dt > 0)
         if near.sum() >= FEWEST:
-            of = table.step[known][near]
+            of = step[known][near]
             moving[i] = told[near] + w[near], told[near], of
             axis, unit = case.space.axes[i].rpartition(".")[2], case.space.axis_units[i]
             label = name if axis in ("", name, "angle") else f"{name} {axis}"
-            told_of += _moves_as(label, unit, of, w[near], told[near], dt[near], slip[near], 2 * d)
+            told_of += _moves_as(label, unit, of, w[near], told[near], dt[near], slip[near], 2 * d, by.times)
     for name, part in case.space.parts.items():
         axes = range(case.space.axes_at[name].start, case.space.axes_at[name].stop)
         if isinstance(part, SO3) and all(i in moving and len(moving[i][0]) == len(moving[axes[0]][0]) for i in axes):
@@ -191,7 +192,7 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Ar
 
 
 def _moves_as(
-    label: str, unit: str, of: np.ndarray, w: Array, told: Array, dt: Array, slip: Array, tests: int
+    label: str, unit: str, of: np.ndarray, w: Array, told: Array, dt: Array, slip: Array, tests: int, times: int = 1
 ) -> Iterator[tuple[float, Finding]]:
     """w = (c − 1)·Δ' + b·dt: which of the two is off, if any. By rates, so that a long step counts like others. Large
     is what is more than 5 % of the motion off, for sure.
@@ -214,27 +215,19 @@ def _moves_as(
         if (ends[0] - 1) * (ends[1] - 1) <= 0:
             return
         # Of what is predicted, against what happens: the end that has a name, or the more careful one.
-        known = [f for f in ends if named(f, unit) != named(1.3, unit)]
+        told_as = of_motion(unit, float(np.median(dt)), times)
+        known = [f for f in ends if likeliest(f, told_as, forth.error)]
         factor = known[0] if known else min(ends, key=lambda f: abs(f - 1))
         p = max(forth.p_beyond(0.0), aback.p_beyond(0.0))
-        severity = judge(p, tests, large=max(forth.p_beyond(_SHEET), aback.p_beyond(_SHEET)))
-        sign = (
-            "its sign is wrong"
-            if abs(factor + 1) < 0.2
-            else "a dt that is multiplied once too often"
-            if abs(factor / float(np.median(dt)) - 1) < 0.1
-            else named(factor, unit)
-            if factor > 0
-            else "a wrong sign and size"
-        )
-        cause = f"{label} is predicted to move by {factor:.3g}× what it does: {sign}"
+        severity = judge(p, tests, large=max(forth.p_beyond(SHEET), aback.p_beyond(SHEET)))
+        cause = f"{label} is predicted to move by {factor:.3g}× what it does: {named(factor, told_as, forth.error)}"
         remedy = (
             f"look at the control that moves {label}: its sign, its unit, its calibration (divide it by {factor:.3g})"
         )
         evidence: dict[str, object] = {"component": label, "factor": factor, "p": p}
     else:
         p_drift = steady.p_beyond(0.0)
-        severity = judge(p_drift, tests, large=steady.p_beyond(_SHEET * float(np.abs(told).mean())))
+        severity = judge(p_drift, tests, large=steady.p_beyond(SHEET * float(np.abs(told).mean())))
         rate = f"{unit}²" if unit.endswith("/s") else f"{unit}/s"
         cause = (
             f"the prediction misses a steady {drift:+.3g} {rate} of {label}: the control that moves it has a bias, "
