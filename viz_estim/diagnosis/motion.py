@@ -17,11 +17,10 @@ from viz_estim.diagnosis.against import slip as bound
 from viz_estim.diagnosis.axes import maps
 from viz_estim.diagnosis.durations import composed, whole
 from viz_estim.diagnosis.evidence import Case, transitions
-from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, Finding, judge
+from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, SURELY, Finding, judge
 from viz_estim.diagnosis.fits import STRETCHES
 from viz_estim.diagnosis.naming import likeliest, named, of_motion
 
-SURELY = 0.95  # of the misfit explained: no error of a linearisation looks like that
 _WORLD = "the world's axes"
 _ALIKE = 1.01  # of the squares that are left: as well explained
 
@@ -130,7 +129,9 @@ def _of_a_cloud(case: Case, carried: clouds.Moves) -> Iterator[Finding]:
         return
     none = np.zeros(int(rows.sum()))
     told_of: list[tuple[float, Finding]] = []
-    for i, (label, unit) in enumerate((("the way ahead", "m"), ("the way to the left", "m"), ("heading", "rad"))):
+    for i, label, unit in ((2, "heading", "rad"), (0, "the way ahead", "m"), (1, "the way to the left", "m")):
+        if i == 1 and any(f.severity == "error" for _, f in told_of):
+            continue  # it goes to the left by how it turns and how far ahead it goes
         told, truly = carried.told[rows, i], carried.truly[rows, i]
         told_of += _moves_as(label, unit, carried.step[rows], truly - told, told, dt[rows], none, 6)
     yield from _best(told_of)
@@ -171,6 +172,9 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Ar
         tried.append((float(np.square(truly - in_world).sum()), _WORLD))
     best, what = min(tried)
     gain, explained = 0.5 * truly.size * np.log(own / max(best, 1e-300)), 1 - best / max(own, 1e-300)
+    # A map must foresee what was predicted: where that follows nothing, a unit that makes all small comes as near.
+    if what != _WORLD and 0.5 * truly.size * np.log(float(np.square(told).sum()) / max(best, 1e-300)) < np.log(ODDS):
+        return None
     least = SURELY if in_world is None else 1 - 1 / GROSS
     if explained < least or judge(float(np.exp(-min(gain, 700.0))), 60, large=True) != "error":
         return None
@@ -216,11 +220,12 @@ def _moves_as(
             return
         # Of what is predicted, against what happens: the end that has a name, or the more careful one.
         told_as = of_motion(unit, float(np.median(dt)), times)
-        known = [f for f in ends if likeliest(f, told_as, forth.error)]
-        factor = known[0] if known else min(ends, key=lambda f: abs(f - 1))
+        both = (ends[0], forth.error * ends[0] ** 2), (ends[1], aback.error)
+        known = [(f, error) for f, error in both if likeliest(f, told_as, error)]
+        factor, error = known[0] if known else min(both, key=lambda one: abs(one[0] - 1))
         p = max(forth.p_beyond(0.0), aback.p_beyond(0.0))
         severity = judge(p, tests, large=max(forth.p_beyond(SHEET), aback.p_beyond(SHEET)))
-        cause = f"{label} is predicted to move by {factor:.3g}× what it does: {named(factor, told_as, forth.error)}"
+        cause = f"{label} is predicted to move by {factor:.3g}× what it does: {named(factor, told_as, error)}"
         remedy = (
             f"look at the control that moves {label}: its sign, its unit, its calibration (divide it by {factor:.3g})"
         )

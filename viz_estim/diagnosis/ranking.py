@@ -37,9 +37,9 @@ def ranked(found: list[Finding]) -> list[Finding]:
 def _of_the_noise(start: Finding, found: list[Finding]) -> Finding:
     """A start that was made of readings is as far off as their R is too small: then that is the cause."""
     for f in found:
-        factor, white = f.evidence.get("factor_on_R"), abs(f.evidence.get("autocorrelation", 1.0)) < 0.2
+        factor, by_R = f.evidence.get("factor_on_R"), f.evidence.get("gain_by_R", 0.0)
         held = factor and chi2.sf(start.evidence["nees"] / factor, start.evidence["dof"]) > 0.01
-        if f.code == "overconfident" and white and held:
+        if f.code == "overconfident" and held and by_R >= f.evidence.get("gain_by_Q", 0.0):
             return _softened(start, f)
     return start
 
