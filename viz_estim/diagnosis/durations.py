@@ -45,6 +45,20 @@ def composed(F: Array, by: Whole) -> Array:
     return made
 
 
+def by_biases(case: Case, table: StageTable, by: Whole, name: str) -> Array:
+    """What biases that are part of the state do to a part (M, d) in whole steps: F's block times their mean, for parts
+    of the unit of its rate. Wrong readings may have taught them; what is left is by the control as it came."""
+    F, space = transitions(case, table), case.space
+    own = space.axes_at[name]
+    done = np.zeros((len(by.step), own.stop - own.start))
+    rate = [_RATE.get(unit) for unit in space.parts[name].axis_units]
+    for other, part in space.parts.items() if F is not None else ():
+        if list(part.axis_units) == rate:
+            block = composed(F, by)[:, own, space.axes_at[other]]
+            done += np.einsum("tij,tj->ti", np.nan_to_num(block), by.before[:, space.at[other]])
+    return done
+
+
 def carried(case: Case) -> Iterator[Finding]:
     """How much of a rate F adds to what it is the rate of: of a constant rate dt, of one that is damped less.
 

@@ -20,7 +20,7 @@ class Against(NamedTuple):
     error of r by the model of the sensor, in standard deviations of R. part: which of the sensor's parts it is, if it
     has several; exact: the model is the filter's own and no line along its Jacobian; attitude (M, d, d): the truth's,
     world from body, if a part of the state says it; places (m, d), position (M, d): of distances, from where the model
-    takes them to be, and to where.
+    takes them to be, and to where. by_control: the model takes the control.
     """
 
     name: str
@@ -38,6 +38,7 @@ class Against(NamedTuple):
     attitude: Array | None
     places: Array | None = None
     position: Array | None = None
+    by_control: bool = False
 
     def pick(self, rows: slice | np.ndarray) -> Against:
         """Some of the readings."""

@@ -11,7 +11,7 @@ import numpy as np
 from viz_estim.core.distributions import chi2, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, wrap
-from viz_estim.diagnosis import clouds
+from viz_estim.diagnosis import clouds, forces
 from viz_estim.diagnosis.against import FEWEST
 from viz_estim.diagnosis.against import slip as bound
 from viz_estim.diagnosis.axes import maps
@@ -40,8 +40,8 @@ def prediction(case: Case) -> Iterator[Finding]:
     moves = [(table, F) for table in run.stages.values() if (F := transitions(case, table)) is not None]
     if not np.isfinite(run.truth).any():
         return
-    if turned := list(_turned(case)):
-        yield from map(_by_estimate, turned)
+    if by_imu := [*forces.forces(case), *_turned(case)]:  # by an accelerometer, by a gyro, or by both
+        yield replace(by_imu[0], cause="; and ".join(f.cause for f in by_imu))
         return
     moved = clouds.moves_of_means(case)
     if moved is not None and (exchanged := _exchanged(moved.truly, moved.told, moved.step)) is not None:
@@ -167,13 +167,14 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Ar
     predicted in the world's axes (M, 3)."""
     own = float(np.square(truly - told).sum())
     # In what was predicted, whose size stays as it is: a unit that makes it small explains nothing by that.
-    tried = [(float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title) for title, A in maps(3, "rad/s")]
+    tried = [(float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title, told @ A.T) for title, A in maps(3, "rad/s")]
     if in_world is not None:
-        tried.append((float(np.square(truly - in_world).sum()), _WORLD))
-    best, what = min(tried)
+        tried.append((float(np.square(truly - in_world).sum()), _WORLD, in_world))
+    best, what, mapped = min(tried, key=lambda one: one[0])
     gain, explained = 0.5 * truly.size * np.log(own / max(best, 1e-300)), 1 - best / max(own, 1e-300)
-    # A map must foresee what was predicted: where that follows nothing, a unit that makes all small comes as near.
-    if what != _WORLD and 0.5 * truly.size * np.log(float(np.square(told).sum()) / max(best, 1e-300)) < np.log(ODDS):
+    # Either way, so that noise of neither passes for a unit that makes it small.
+    back = float(np.square(truly - mapped).sum())
+    if what != _WORLD and not (forces.foreseen(told, best) and forces.foreseen(truly, back)):
         return None
     least = SURELY if in_world is None else 1 - 1 / GROSS
     if explained < least or judge(float(np.exp(-min(gain, 700.0))), 60, large=True) != "error":

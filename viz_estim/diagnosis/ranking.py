@@ -53,10 +53,14 @@ def _follows(finding: Finding, cause: Finding) -> bool:
         return True
     if cause.code in _SENT and finding.evidence.get("against") == "truth":
         return False
+    if finding.code == "start" and cause.code == "units_or_axes" and _of_readings(cause):
+        return True  # which it may be made of
     if finding.code == "process_model" and _of_the_gyro(cause):
         return True  # which moves the prediction
     if cause.code == "process_model" and _of_the_gyro(finding):
         return False
+    if "by_control" in finding.evidence and cause.code == "process_model" and "map" in cause.evidence:
+        return True  # which a model of readings takes too
     if "by_estimate" in finding.evidence and _of_readings(cause):
         return True
     if "by_estimate" in cause.evidence and _of_readings(finding):

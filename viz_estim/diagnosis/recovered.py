@@ -31,6 +31,7 @@ class Recovered(NamedTuple):
     slip: Array
     places: Array | None = None  # (m, d): of distances, from where
     position: Array | None = None  # (M, d): the truth's, to which the distances are
+    by_control: bool = False  # whether it takes the control, as of a place off the origin that turns with the body
 
 
 def recovered(
@@ -50,7 +51,11 @@ def recovered(
         std = std if len(std) == predicted.shape[1] else np.full(predicted.shape[1], std.mean())
         if set(part.axis_units) == {"m"} and (found := _distances(own, mean, truth, predicted, std)) is not None:
             return found
-        fits = [one for kind in _kinds(own, control) if (one := _by(kind, mean, truth, predicted, std)) is not None]
+        fits = [
+            one._replace(by_control=steered)
+            for kind, steered in _kinds(own, control)
+            if (one := _by(kind, mean, truth, predicted, std)) is not None
+        ]
         best = min(fits, key=lambda one: float(np.median(one.slip)), default=None)  # many numbers fit any few pairs
         if best is not None and isinstance(part, S2):
             return best._replace(true=best.true / np.linalg.norm(best.true, axis=1, keepdims=True))
@@ -90,8 +95,10 @@ def _distances(
     return None
 
 
-def _kinds(own: list[tuple[str, Space, slice]], control: Array | None) -> Iterator[Callable[[Array], Array]]:
-    """Straight lines in the state's plain numbers, in a rotation's entries, and in vectors seen from the body."""
+def _kinds(own: list[tuple[str, Space, slice]], control: Array | None) -> Iterator[tuple[Callable[[Array], Array], bool]]:
+    """Straight lines in the state's plain numbers, in a rotation's entries, and in vectors seen from the body; and
+    whether the control is among their numbers."""
+    steered = control is not None
     plain = [at for _, leaf, at in own if isinstance(leaf, Euclidean)]
     turns = [at for _, leaf, at in own if isinstance(leaf, SO3)]
     headings = [at for _, leaf, at in own if isinstance(leaf, SO2)]
@@ -99,21 +106,25 @@ def _kinds(own: list[tuple[str, Space, slice]], control: Array | None) -> Iterat
     def numbers(x: Array) -> Array:
         return _affine(np.concatenate([x[:, at] for at in plain], axis=1)) if plain else np.ones((len(x), 1))
 
-    yield numbers
+    yield numbers, False
     for turn in turns:
-        yield lambda x, turn=turn: quaternions.to_matrix(x[:, turn]).reshape(len(x), 9)  # type: ignore[misc]
+        yield lambda x, turn=turn: quaternions.to_matrix(x[:, turn]).reshape(len(x), 9), False  # type: ignore[misc]
         for at in plain:
             if at.stop - at.start == 3:
                 # The body's rate, by which a place off its origin moves, is the control's or a part of the state.
-                yield lambda x, turn=turn, at=at: _seen(x, turn, at, control)  # type: ignore[misc]
+                yield lambda x, turn=turn, at=at: _seen(x, turn, at, control), steered  # type: ignore[misc]
                 yield (
                     lambda x, turn=turn, at=at: np.concatenate(  # type: ignore[misc]
                         [_seen(x, turn, at, control), numbers(x)[:, :-1]], axis=1
-                    )
+                    ),
+                    steered,
                 )
     for heading in headings:
-        yield lambda x, heading=heading: np.concatenate(  # type: ignore[misc]
-            [numbers(x), np.cos(x[:, heading]), np.sin(x[:, heading])], axis=1
+        yield (
+            lambda x, heading=heading: np.concatenate(  # type: ignore[misc]
+                [numbers(x), np.cos(x[:, heading]), np.sin(x[:, heading])], axis=1
+            ),
+            False,
         )
 
 

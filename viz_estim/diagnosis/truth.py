@@ -48,6 +48,7 @@ def sensors(case: Case) -> Iterator[Finding]:
         _, one, cause, severity = max(found[likeliest], key=lambda entry: entry[0])
         steps = int(one.step[0]), int(one.step[-1])
         evidence = cause.evidence | {"p": cause.p, "explained": cause.explained, "against": "truth"}
+        evidence |= {"by_control": True} if one.by_control else {}
         known = parameter(case.run, f"{name}_bias")
         estimated = f"set {known[0]}=estimate; or " if known and known[1] != "estimate" and not cause.known else ""
         yield Finding(cause.code, severity, name, steps, evidence, cause.cause, estimated + cause.remedy)
