@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from viz_estim.diagnosis import (
+    clocks,
     confidence,
     copies,
     covariance,
@@ -19,6 +20,7 @@ from viz_estim.diagnosis import (
     icp,
     innovations,
     kinematics,
+    mirrored,
     models,
     motion,
     particles,
@@ -28,6 +30,7 @@ from viz_estim.diagnosis import (
     stamps,
     truth,
     updates,
+    weighing,
 )  # fmt: skip
 from viz_estim.diagnosis.evidence import Case, case
 from viz_estim.diagnosis.finding import CODES, SYMPTOMS, Finding
@@ -56,6 +59,7 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     signatures.biases,
     errors.start,
     truth.sensors,
+    weighing.noises,
     errors.by_part,
     covariance.broken,
     updates.updates,
@@ -67,6 +71,7 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     geometry.wraps,
     geometry.quaternion_norms,
     geometry.units_or_axes,
+    clocks.clock,
     durations.carried,
     copies.together,
     copies.weighed_again,
@@ -78,6 +83,7 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     icp.few_matches,
     icp.rising,
     icp.settled,
+    mirrored.mirrored,
 )
 
 

@@ -14,6 +14,7 @@ from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import SHEET, Finding, judge, level
 from viz_estim.diagnosis.fits import STRETCHES
+from viz_estim.diagnosis.naming import likeliest, of_motion
 from viz_estim.diagnosis.sensors import Imu, imu
 from viz_estim.scenarios.imu_health import GRAVITY
 
@@ -83,10 +84,12 @@ def scale(case: Case) -> Iterator[Finding]:
     if severity and s > 0:
         k = next(k for k, one in enumerate(found) if one[1] == p)
         which = "gyro" if k == 0 else f"gyro's {'xyz'[k - 1]}"
+        names = likeliest(1 / s, of_motion("rad", 0.0))
+        as_if = f": {', or '.join(names)}" if names else ": its sensitivity is another one"
         yield Finding(
             "units_or_axes", severity, "gyro", steps,
             {"map": f"a factor of {1 / s:.3g}", "p": p, "factors": [1 / one[0] for one in found]},
-            f"the {which} reads {1 / s:.3g}× the turn that gravity shows: its sensitivity is another one",
+            f"the {which} reads {1 / s:.3g}× the turn that gravity shows{as_if}",
             f"divide the {which} by {1 / s:.3g}, or calibrate it (`viz-estim calibrate imu`)",
         )  # fmt: skip
 

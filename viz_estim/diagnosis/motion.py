@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
-from viz_estim.core.distributions import chi2, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, wrap
 from viz_estim.diagnosis import clouds, forces
@@ -18,7 +16,7 @@ from viz_estim.diagnosis.axes import maps
 from viz_estim.diagnosis.durations import composed, whole
 from viz_estim.diagnosis.evidence import Case, transitions
 from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, SURELY, Finding, judge
-from viz_estim.diagnosis.fits import STRETCHES
+from viz_estim.diagnosis.fits import slope
 from viz_estim.diagnosis.naming import likeliest, named, of_motion
 
 _WORLD = "the world's axes"
@@ -207,7 +205,7 @@ def _moves_as(
     """
     w, told, slip = w / dt, told / dt, slip / dt
     one, truly = np.ones_like(told), told + w
-    steady, forth, aback = _slope(w, one), _slope(w, told), _slope(-w, truly)
+    steady, forth, aback = slope(w, one), slope(w, told), slope(-w, truly)
     drift, beta, back, left_drift, left_factor = steady.value, forth.value, aback.value, steady.left, forth.left
     ends = 1 / (1 + beta) if beta != -1 else np.inf, 1 + back
     by_factor = left_factor < left_drift
@@ -245,31 +243,3 @@ def _moves_as(
         evidence = {"component": label, "drift": drift, "p": p_drift}
     if severity:
         yield share, Finding("process_model", severity, None, steps, evidence | {"against": "truth"}, cause, remedy)
-
-
-class Slope(NamedTuple):
-    """A slope through zero, its standard error and degrees of freedom, and Σ of the squares that are left."""
-
-    value: float
-    error: float
-    dof: float
-    left: float
-
-    def p_beyond(self, size: float) -> float:
-        """The chance of such a slope where it is of this size."""
-        return float(2 * t.sf(max(abs(self.value) - size, 0.0) / max(self.error, 1e-300), self.dof))
-
-
-def _slope(y: Array, x: Array) -> Slope:
-    """Of y on x (M,), with a standard error by 20 stretches of the run where that is larger."""
-    A = float(x @ x)
-    if A <= 0:
-        return Slope(0.0, 1.0, 1.0, float(y @ y))
-    slope = float(x @ y) / A
-    left = y - slope * x
-    pieces = np.array([part.sum() for part in np.array_split(x * left, min(STRETCHES, len(y) // 5))])
-    B = len(pieces)
-    scatter, model = float(pieces @ pieces) * B / (B - 1) / A**2, float(left @ left) / len(y) / A
-    if scatter < model * chi2.isf(0.01, B - 1) / (B - 1):
-        return Slope(slope, float(np.sqrt(model)), len(y) - 1, float(left @ left))
-    return Slope(slope, float(np.sqrt(scatter)), B - 1, float(left @ left))

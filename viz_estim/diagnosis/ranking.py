@@ -61,6 +61,9 @@ def _follows(finding: Finding, cause: Finding) -> bool:
         return False
     if "by_control" in finding.evidence and cause.code == "process_model" and "map" in cause.evidence:
         return True  # which a model of readings takes too
+    by_innovations = finding.code == "units_or_axes" and "against" not in finding.evidence and not _of_the_gyro(finding)
+    if by_innovations and cause.code == "process_model" and "by_estimate" not in cause.evidence:
+        return True  # which sends the estimate elsewhere, so that readings look as if of another unit
     if "by_estimate" in finding.evidence and _of_readings(cause):
         return True
     if "by_estimate" in cause.evidence and _of_readings(finding):
