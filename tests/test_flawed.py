@@ -42,6 +42,11 @@ OTHER: dict[str, dict[str, Any]] = {
     "inverse-attitude": {"duration": 2.5},
     "real-part-last": {"duration": 2.5},
     "camera-turned": {"duration": 3.0},
+    "accelerometer-for-gyro": {"duration": 1.5},
+    "exchanged-labels": {"duration": 34.0},
+    "predicts-twice": {"duration": 2.0},
+    "one-range-for-both": {"duration": 2.0},
+    "milliseconds": {"duration": 2.0},
 }
 STEPS = {
     "arithmetic-quaternion-mean": 50,
@@ -60,6 +65,10 @@ STEPS = {
     "long-ranges": 40,
     "clamped-particles": 30,
     "noise-too-small-for-particles": 30,
+    "one-draw-for-all": 8,
+    "weights-kept": 8,
+    "turns-in-degrees": 36,
+    "variance-for-deviation": 32,
 }
 
 

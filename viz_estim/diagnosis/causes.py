@@ -13,7 +13,6 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean
 from viz_estim.diagnosis.axes import explains, maps
-from viz_estim.diagnosis.finding import GROSS
 from viz_estim.diagnosis.fits import Against, Fitted, fitted, white
 from viz_estim.diagnosis.naming import named, of_reading
 
@@ -156,7 +155,8 @@ def listed(one: Against, left: float, what: str, explained: float) -> Cause | No
     """A map without a number that is fitted, by the sum of squares that it leaves: of 60 that are tried."""
     own, (M, m) = float((white(one, one.r) ** 2).sum()), one.r.shape
     gain = 0.5 * M * m * float(np.log(own / max(left, 1e-300)))
-    if not explains(what, explained) or own < GROSS * left:
+    nothing = float((white(one, one.z[:, :m]) ** 2).sum())
+    if not explains(what, own, left, nothing, M * m):
         return None
     return Cause(
         "units_or_axes", gain, 1, float(np.exp(-min(gain, 700.0))) * 60, True, float(np.sqrt(own / (M * m))), explained,

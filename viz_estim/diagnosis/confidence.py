@@ -122,12 +122,10 @@ def _lacks_dt(of: tuning.Tuned, case: Case) -> str:
 
 
 def _more_noise(factor: float, of: tuning.Tuned, case: Case) -> str:
+    more = f"multiply Q by about {factor:.2g}, its standard deviations by {factor**0.5:.2g}"
     if _lacks_dt(of, case):
-        return "make Q of the step's dt: a noise of the input by G·V·Gᵀ with dt in G, a density by ∫"
-    return (
-        f"multiply Q by about {factor:.2g}, its standard deviations by {factor**0.5:.2g}; where the model lacks a "
-        "motion, add that to the state instead"
-    )
+        return f"{more}; or make it of the step's dt, by G·V·Gᵀ with dt in G where it is the noise of an input"
+    return f"{more}; where the model lacks a motion, add that to the state instead"
 
 
 def ljung_box(readings: Readings, lags: int = 10) -> float:

@@ -52,8 +52,8 @@ def by_biases(case: Case, table: StageTable, by: Whole, name: str) -> Array:
     own = space.axes_at[name]
     done = np.zeros((len(by.step), own.stop - own.start))
     rate = [_RATE.get(unit) for unit in space.parts[name].axis_units]
-    for other, part in space.parts.items() if F is not None else ():
-        if list(part.axis_units) == rate:
+    for other, part in space.parts.items():
+        if F is not None and list(part.axis_units) == rate:
             block = composed(F, by)[:, own, space.axes_at[other]]
             done += np.einsum("tij,tj->ti", np.nan_to_num(block), by.before[:, space.at[other]])
     return done

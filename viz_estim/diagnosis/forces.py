@@ -24,6 +24,7 @@ from viz_estim.scenarios.imu_health import GRAVITY
 
 _UP = np.array([0.0, 0.0, GRAVITY])
 _FEWEST = 12
+_OTHERS = "; others of the list do too, for it is along one axis"
 _EXCHANGED = "gyro and accelerometer"
 
 
@@ -119,6 +120,6 @@ def forces(case: Case) -> Iterator[Finding]:
     yield Finding(
         "process_model", "error", None, steps, evidence,
         f"the velocity is predicted by another specific force than the body feels: the accelerometer {words} explains "
-        f"{explained:.0%} of the difference" + "; others of the list do too, for it is along one axis" * (len(alike) > 1),
+        f"{explained:.0%} of the difference" + _OTHERS * (len(alike) > 1),
         f"check the order, the signs and the unit of the accelerometer: the best map is `{what}`",
     )  # fmt: skip

@@ -10,9 +10,9 @@ from viz_estim.core import quaternions
 from viz_estim.core.distributions import t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3
-from viz_estim.diagnosis.axes import explains, finding_of, maps
+from viz_estim.diagnosis.axes import explains, finding_of, maps, units
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import SHEET, Finding, judge, level
+from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, Finding, judge, level
 from viz_estim.diagnosis.fits import STRETCHES
 from viz_estim.diagnosis.naming import likeliest, of_motion
 from viz_estim.diagnosis.sensors import Imu, imu
@@ -52,16 +52,18 @@ def imu_axes(case: Case) -> Iterator[Finding]:
     nothing = float(np.square(change).sum())  # what no turn at all would leave: a map that is no better is none
     if gain > -np.log(level("error", 2 * len(candidates))):
         blamed = _blamed(case, both)
-        if blamed == "accel" and min(of_force) < 1.5 * least:
+        # Another map of the other sensor, where that is as likely: their windows share pushes of the hand.
+        alike = 0.5 * change.size / _DEPENDENT * np.log(min(of_force) / max(least, 1e-300)) < np.log(ODDS)
+        if blamed == "accel" and alike:
             name, what = "accel", candidates[int(np.argmin(of_force))][0]
         else:
             name, what = "gyro", candidates[int(np.argmin(of_rate))][0]
-        if explains(what, explained) and least < 0.5 * nothing:
+        if explains(what, own, least, nothing, change.size // _DEPENDENT) and nothing > GROSS * least:
             yield finding_of(name, steps, what, explained, gain)
-    if not 0.5 < length / GRAVITY < 2:
-        factor = min((abs(np.log(length * M[0, 0] / GRAVITY)), t) for t, M in maps(3, "m/s²") if t[:4] != "axes")
-        if factor[0] < 0.2:
-            yield finding_of("accel", steps, factor[1], 1 - abs(1 - np.exp(factor[0])), float(len(both.rows)))
+    if not 1 / GROSS < length / GRAVITY < GROSS:  # a hand pulls by less than gravity, in the middle over a run
+        for what in likeliest(length / GRAVITY, {name: 1 / value for name, value in units("m/s²").items()})[:1]:
+            left = abs(np.log(length / GRAVITY * units("m/s²")[what]))
+            yield finding_of("accel", steps, what, float(np.exp(-left)), float(len(both.rows)))
 
 
 def scale(case: Case) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Are a registration's clouds of one hand and in one order of axes? By how they lie on each other where the truth is."""
+"""Are a registration's clouds of one hand and in one order of axes? By how they lie at the truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ _FEWEST = 30  # points of each cloud
 def clouds(case: Case) -> tuple[Array, Array, float] | None:
     """The points of the moved cloud in its own frame (N, d) and of the fixed one (M, d) that ever had a match,
     and the middle distance of the last pairs."""
-    table = next((t for t in case.run.stages.values() if "matches.source_index" in t.values and "mean" in t.values), None)
+    table = next(
+        (t for t in case.run.stages.values() if "matches.source_index" in t.values and "mean" in t.values), None
+    )
     if table is None:
         return None
     X: dict[int, Array] = {}
@@ -34,7 +36,11 @@ def clouds(case: Case) -> tuple[Array, Array, float] | None:
             Y.update(zip(j.astype(int).tolist(), target, strict=True))
     if min(len(X), len(Y)) < _FEWEST:
         return None
-    return np.array(list(X.values())), np.array(list(Y.values())), float(np.median(table.values["matches.distance"][-1]))
+    return (
+        np.array(list(X.values())),
+        np.array(list(Y.values())),
+        float(np.median(table.values["matches.distance"][-1])),
+    )
 
 
 def mirrored(case: Case) -> Iterator[Finding]:

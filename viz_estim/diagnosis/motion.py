@@ -15,7 +15,7 @@ from viz_estim.diagnosis.against import slip as bound
 from viz_estim.diagnosis.axes import maps
 from viz_estim.diagnosis.durations import composed, whole
 from viz_estim.diagnosis.evidence import Case, transitions
-from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, SURELY, Finding, judge
+from viz_estim.diagnosis.finding import GROSS, SHEET, SURELY, Finding, judge
 from viz_estim.diagnosis.fits import slope
 from viz_estim.diagnosis.naming import likeliest, named, of_motion
 
@@ -165,7 +165,9 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Ar
     predicted in the world's axes (M, 3)."""
     own = float(np.square(truly - told).sum())
     # In what was predicted, whose size stays as it is: a unit that makes it small explains nothing by that.
-    tried = [(float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title, told @ A.T) for title, A in maps(3, "rad/s")]
+    tried = [
+        (float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title, told @ A.T) for title, A in maps(3, "rad/s")
+    ]
     if in_world is not None:
         tried.append((float(np.square(truly - in_world).sum()), _WORLD, in_world))
     best, what, mapped = min(tried, key=lambda one: one[0])

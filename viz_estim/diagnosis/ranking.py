@@ -29,9 +29,22 @@ def ranked(found: list[Finding]) -> list[Finding]:
         others = [f.code == "biased_innovation" and "bias" not in f.evidence for f in found]
         found = [_softened(f, best) if other else f for f, other in zip(found, others, strict=True)]
     found = [_of_the_noise(f, found) if f.code == "start" else f for f in found]
+    found = _as_large_as_their_errors(found)
     errors = [f for f in found if f.severity == "error" and f.code != "sensor_silent"]
     first = sorted(errors, key=lambda finding: finding.tier)  # the cause at the root is what is to be mended
     return [_softened(f, next((c for c in first if _follows(f, c)), None)) for f in found]
+
+
+def _as_large_as_their_errors(found: list[Finding]) -> list[Finding]:
+    """Information from nowhere is no matter of chance, and is an error where nothing but what follows from it is one."""
+    errors = [f for f in found if f.severity == "error"]
+    if not errors or any(f.code not in SYMPTOMS for f in errors):
+        return found
+    of = {f.sensor for f in errors}
+    claims = [
+        f.code == "unobservable_update" and f.severity == "warning" and bool({f.sensor, None} & of) for f in found
+    ]
+    return [replace(f, severity="error") if claim else f for f, claim in zip(found, claims, strict=True)]
 
 
 def _of_the_noise(start: Finding, found: list[Finding]) -> Finding:

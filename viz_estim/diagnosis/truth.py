@@ -17,9 +17,7 @@ from viz_estim.diagnosis.causes import Cause
 from viz_estim.diagnosis.evidence import Case, parameter
 from viz_estim.diagnosis.finding import Finding, Severity, judge
 from viz_estim.diagnosis.fits import Against
-
-_SMALL = 0.1  # of R's standard deviation: what a hundred readings would tell
-_SHARE = 0.2  # of what is off, at least; it chooses among causes, and of false alarms it can but take some away
+from viz_estim.diagnosis.recovered import exact
 
 
 def sensors(case: Case) -> Iterator[Finding]:
@@ -29,7 +27,8 @@ def sensors(case: Case) -> Iterator[Finding]:
     log-likelihood less ½·k·log M is told (Schwarz 1978), summed over the sensor's targets and parts, which one delay or
     one exchange concerns alike. p is of the t-test of the worst coefficient with a variance by 20 stretches of the run
     (Liang and Zeger 1986), so that truth and noise may be coloured. Large is a bias or a factor that doubles the
-    squared error with which the filter foresees the reading, and a lag beyond half of a step.
+    squared error with which the filter foresees the reading, and a lag beyond half of a step. A cause must be
+    larger than the model's own error, and than what so many readings tell.
     """
     those = against(case)
     tests = sum(len(one.space.axes) + 2 for one in those)
@@ -41,7 +40,7 @@ def sensors(case: Case) -> Iterator[Finding]:
         for kind, cause in _causes(one, those, interval):
             severity, score = judge(cause.p, tests, large=cause.large), cause.score(len(one.step))
             total[name, kind] = total.get((name, kind), 0.0) + max(score, 0.0)
-            if severity and cause.size > max(slip, _SMALL) and cause.explained > _SHARE:
+            if severity and cause.size > max(slip, exact(len(one.step))):
                 found.setdefault((name, kind), []).append((score, one, cause, severity))
     for name in dict.fromkeys(name for name, _ in found):
         likeliest = max((key for key in found if key[0] == name), key=lambda key: total[key])
