@@ -36,7 +36,7 @@ def ranked(found: list[Finding]) -> list[Finding]:
 
 
 def _as_large_as_their_errors(found: list[Finding]) -> list[Finding]:
-    """Information from nowhere is no matter of chance, and is an error where nothing but what follows from it is one."""
+    """Information from nowhere is no matter of chance, and an error where only what follows from it is one."""
     errors = [f for f in found if f.severity == "error"]
     if not errors or any(f.code not in SYMPTOMS for f in errors):
         return found
