@@ -159,7 +159,8 @@ def listed(one: Against, left: float, what: str, explained: float) -> Cause | No
     if not explains(what, own, left, nothing, M * m):
         return None
     return Cause(
-        "units_or_axes", gain, 1, float(np.exp(-min(gain, 700.0))) * 60, True, float(np.sqrt(own / (M * m))), explained,
+        "units_or_axes", gain, 1, float(np.exp(-min(gain, 700.0))) * 60, True,
+        float(np.sqrt(max(own - left, 0.0) / (M * m))), explained,
         {"map": what, "log_likelihood_gain": gain}, "", "", True,
     )  # fmt: skip
 

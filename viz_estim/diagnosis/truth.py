@@ -17,7 +17,8 @@ from viz_estim.diagnosis.causes import Cause
 from viz_estim.diagnosis.evidence import Case, parameter
 from viz_estim.diagnosis.finding import Finding, Severity, judge
 from viz_estim.diagnosis.fits import Against
-from viz_estim.diagnosis.recovered import exact
+
+_SMALL = 0.1  # of R's standard deviation: a hundredth of the squares that noise alone has
 
 
 def sensors(case: Case) -> Iterator[Finding]:
@@ -28,7 +29,8 @@ def sensors(case: Case) -> Iterator[Finding]:
     one exchange concerns alike. p is of the t-test of the worst coefficient with a variance by 20 stretches of the run
     (Liang and Zeger 1986), so that truth and noise may be coloured. Large is a bias or a factor that doubles the
     squared error with which the filter foresees the reading, and a lag beyond half of a step. A cause must be
-    larger than the model's own error, and than what so many readings tell.
+    larger than the model's own error, and than a tenth of the noise, which adds a hundredth to its squares: an effect
+    that is smaller matters to no filter.
     """
     those = against(case)
     tests = sum(len(one.space.axes) + 2 for one in those)
@@ -40,7 +42,7 @@ def sensors(case: Case) -> Iterator[Finding]:
         for kind, cause in _causes(one, those, interval):
             severity, score = judge(cause.p, tests, large=cause.large), cause.score(len(one.step))
             total[name, kind] = total.get((name, kind), 0.0) + max(score, 0.0)
-            if severity and cause.size > max(slip, exact(len(one.step))):
+            if severity and cause.size > max(slip, _SMALL):
                 found.setdefault((name, kind), []).append((score, one, cause, severity))
     for name in dict.fromkeys(name for name, _ in found):
         likeliest = max((key for key in found if key[0] == name), key=lambda key: total[key])
