@@ -19,6 +19,8 @@ from viz_estim.diagnosis.finding import Finding, Severity, judge
 from viz_estim.diagnosis.fits import Against
 
 _SMALL = 0.1  # of R's standard deviation: a hundredth of the squares that noise alone has
+# Of what is off beyond the noise, at least; it chooses among causes, and of false alarms it can but take some away.
+_SHARE = 0.2
 
 
 def sensors(case: Case) -> Iterator[Finding]:
@@ -42,7 +44,7 @@ def sensors(case: Case) -> Iterator[Finding]:
         for kind, cause in _causes(one, those, interval):
             severity, score = judge(cause.p, tests, large=cause.large), cause.score(len(one.step))
             total[name, kind] = total.get((name, kind), 0.0) + max(score, 0.0)
-            if severity and cause.size > max(slip, _SMALL):
+            if severity and cause.size > max(slip, _SMALL) and cause.explained > _SHARE:
                 found.setdefault((name, kind), []).append((score, one, cause, severity))
     for name in dict.fromkeys(name for name, _ in found):
         likeliest = max((key for key in found if key[0] == name), key=lambda key: total[key])
