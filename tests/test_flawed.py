@@ -32,6 +32,7 @@ OTHER: dict[str, dict[str, Any]] = {
     "process-noise-too-small": {"duration": 14.0},
     "glitches": {"duration": 20.0},
     "clipped-ranges": {"duration": 20.0},
+    "turns-in-the-world": {"duration": 6.0},
     "gyro-freeze": {"duration": 4.6, "freeze": 1.5},
     "bias-by-median": {"duration": 5.0, "still": 3.0},
     "delay-of-50-ms": {"duration": 4.2},
@@ -44,6 +45,11 @@ OTHER: dict[str, dict[str, Any]] = {
     "inverse-attitude": {"duration": 2.5},
     "real-part-last": {"duration": 2.5},
     "camera-turned": {"duration": 2.0},
+    "accelerometer-for-gyro": {"duration": 1.5},
+    "exchanged-labels": {"duration": 34.0},
+    "predicts-twice": {"duration": 2.0},
+    "one-range-for-both": {"duration": 2.0},
+    "milliseconds": {"duration": 2.0},
 }
 STEPS = {
     "arithmetic-quaternion-mean": 50,
@@ -55,7 +61,6 @@ STEPS = {
     "degrees-as-radians": 270,
     "g-as-mps2": 100,
     "gyro-freeze": 380,
-    "turns-in-the-world": 350,
     "delay-of-50-ms": 410,
     "exchanged-beacons": 40,
     "misplaced-beacon": 40,
@@ -64,6 +69,10 @@ STEPS = {
     "long-ranges": 40,
     "clamped-particles": 30,
     "noise-too-small-for-particles": 30,
+    "one-draw-for-all": 8,
+    "weights-kept": 8,
+    "turns-in-degrees": 36,
+    "variance-for-deviation": 32,
 }
 
 

@@ -9,23 +9,29 @@ from typing import Any
 import numpy as np
 
 from viz_estim.diagnosis import (
+    clocks,
     confidence,
+    copies,
     covariance,
+    durations,
     errors,
     gates,
     geometry,
     icp,
     innovations,
     kinematics,
+    mirrored,
     models,
     motion,
     particles,
+    places,
     repeats,
     sensors,
     signatures,
     stamps,
     truth,
     updates,
+    weighing,
 )  # fmt: skip
 from viz_estim.diagnosis.evidence import Case, case
 from viz_estim.diagnosis.finding import CODES, SYMPTOMS, Finding
@@ -39,6 +45,7 @@ OF_SENSORS: tuple[Callable[[Run], Iterator[Finding]], ...] = (
     sensors.frozen,
     sensors.silent,
     repeats.used_twice,
+    repeats.one_for_two,
     sensors.biased_at_rest,
     stamps.stamps,
 )
@@ -53,6 +60,8 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     signatures.biases,
     errors.start,
     truth.sensors,
+    weighing.noises,
+    places.exchanged,
     errors.by_part,
     covariance.broken,
     updates.updates,
@@ -64,6 +73,10 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     geometry.wraps,
     geometry.quaternion_norms,
     geometry.units_or_axes,
+    clocks.clock,
+    durations.carried,
+    copies.together,
+    copies.weighed_again,
     particles.collapsed,
     particles.clamped,
     particles.far,
@@ -72,6 +85,7 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     icp.few_matches,
     icp.rising,
     icp.settled,
+    mirrored.mirrored,
 )
 
 

@@ -77,6 +77,7 @@ def _against(case: Case) -> Iterator[Against]:
                     None if attitude is None else attitude[rows][near],
                     None if model is None else model.places,
                     None if model is None or model.position is None else model.position[near],
+                    model is not None and model.by_control,
                 )  # fmt: skip
 
 

@@ -9,21 +9,30 @@ from itertools import permutations, product
 import numpy as np
 
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.finding import Finding
+from viz_estim.diagnosis.finding import GROSS, ODDS, Finding
 from viz_estim.scenarios.imu_health import GRAVITY
 
-_AXES, _UNIT = 0.5, 0.8  # of the misfit, for a map to be named: a unit is off by a factor, and leaves noise alone
 UNITS = {  # by what a sensor reads: the factor that brings a reading to what was expected
     "rad": {"degrees for radians": np.pi / 180, "radians for degrees": 180 / np.pi},
     "m/s²": {"g for m/s²": GRAVITY, "m/s² for g": 1 / GRAVITY},
-    "m/s": {"km/h for m/s": 1 / 3.6, "m/s for km/h": 3.6, "feet for m": 0.3048, "mm for m": 1e-3, "m for mm": 1e3},
+    "m/s": {
+        "km/h for m/s": 1 / 3.6,
+        "m/s for km/h": 3.6,
+        "feet for m": 0.3048,
+        "m for feet": 1 / 0.3048,
+        "mm for m": 1e-3,
+        "m for mm": 1e3,
+    },
     "m": {"mm for m": 1e-3, "m for mm": 1e3, "cm for m": 1e-2, "feet for m": 0.3048, "m for feet": 1 / 0.3048},
 }
 
 
-def explains(title: str, explained: float) -> bool:
-    """Whether a map explains enough of the misfit to be named as its cause."""
-    return explained > (_AXES if title.startswith("axes") else _UNIT)
+def explains(title: str, own: float, left: float, nothing: float, count: int) -> bool:
+    """Whether a map is named: it leaves a GROSS-th at most of the squares `own`, and foresees what there is likelier by
+    ODDS than nothing at all does, which leaves the squares `nothing` of `count` numbers: a unit that makes all small is
+    none. These choose among causes; that there is one, the likelihood ratio says."""
+    foreseen = 0.5 * count * np.log(nothing / max(left, 1e-300)) > np.log(ODDS)
+    return bool(own > GROSS * left and (title.startswith("axes") or foreseen))
 
 
 def units(unit: str) -> dict[str, float]:

@@ -12,13 +12,12 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean
-from viz_estim.diagnosis.axes import explains, maps, units
-from viz_estim.diagnosis.finding import GROSS
+from viz_estim.diagnosis.axes import explains, maps
 from viz_estim.diagnosis.fits import Against, Fitted, fitted, white
+from viz_estim.diagnosis.naming import named, of_reading
 
 _SPAN = 0.1  # s over which a rate is taken at least: noise of the truth would hide it in a shorter one
 _SQUARE = "squares"
-_NEAR = 0.1  # a factor is that of a known unit, or −1, within a tenth
 
 
 class Cause(NamedTuple):
@@ -156,10 +155,12 @@ def listed(one: Against, left: float, what: str, explained: float) -> Cause | No
     """A map without a number that is fitted, by the sum of squares that it leaves: of 60 that are tried."""
     own, (M, m) = float((white(one, one.r) ** 2).sum()), one.r.shape
     gain = 0.5 * M * m * float(np.log(own / max(left, 1e-300)))
-    if not explains(what, explained) or own < GROSS * left:
+    nothing = float((white(one, one.z[:, :m]) ** 2).sum())
+    if not explains(what, own, left, nothing, M * m):
         return None
     return Cause(
-        "units_or_axes", gain, 1, float(np.exp(-min(gain, 700.0))) * 60, True, float(np.sqrt(own / (M * m))), explained,
+        "units_or_axes", gain, 1, float(np.exp(-min(gain, 700.0))) * 60, True,
+        float(np.sqrt(max(own - left, 0.0) / (M * m))), explained,
         {"map": what, "log_likelihood_gain": gain}, "", "", True,
     )  # fmt: skip
 
@@ -180,19 +181,9 @@ def scaled(one: Against) -> Iterator[Cause]:
         "units_or_axes", fit.gain, 1, float(fit.p[0]), fit.p_beyond(0, foreseen / max(unit_size, 1e-300)),
         abs(factor - 1) * unit_size, fit.explained, {"map": f"a factor of {factor:.4g}", "factor": factor},
         f"readings of {one.label} are {factor:.4g}× what the truth would give: "
-        f"{named(factor, one.space.axis_units[0])}",
+        f"{named(factor, of_reading(one.space.axis_units[0]), float(fit.error[0]))}",
         f"divide the readings of {one.label} by {factor:.4g}, or calibrate its scale",
     )  # fmt: skip
-
-
-def named(factor: float, unit: str) -> str:
-    """What a factor of a reading may come from."""
-    if abs(factor / 2 - 1) < _NEAR:
-        return "twice, as a round trip taken for the way there"
-    known = [title for title, value in units(unit).items() if abs(factor * value - 1) < _NEAR]
-    if known:
-        return known[0]
-    return "a sign" if abs(factor + 1) < _NEAR else "a scale factor that is not 1"
 
 
 def _std(one: Against) -> Array:

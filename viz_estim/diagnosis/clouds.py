@@ -13,8 +13,10 @@ import numpy as np
 
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
-from viz_estim.core.spaces import SE2, SO2, SO3
+from viz_estim.core.spaces import SE2, SO2, SO3, wrap
+from viz_estim.diagnosis.durations import by_biases, whole
 from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.finding import SURELY, level
 
 _FEWEST = 20
 WINDOW = 0.1  # s
@@ -50,7 +52,23 @@ def moves(case: Case) -> Moves | None:
     if len(kept) < _FEWEST:
         return None
     steps, truly_, told_ = zip(*kept, strict=True)
-    return Moves(np.array(steps), np.array(truly_), np.array(told_))
+    return _unwrapped(case, Moves(np.array(steps), np.array(truly_), np.array(told_)))
+
+
+def _unwrapped(case: Case, found: Moves) -> Moves:
+    """With turns of more than a half one where the control tells of them: by the number of it that the turns follow
+    best, all around the circle (Rayleigh's test; Mardia and Jupp 2000, section 6.3)."""
+    run = case.run
+    row = np.searchsorted(run.step, found.step)
+    if "control" not in run.inputs or not np.isfinite(run.inputs["control"][row]).all():
+        return found
+    turns = run.inputs["control"][row] * run.dt[row][:, None]
+    off = wrap(found.told[:, 2:] - turns)
+    follows = np.exp(1j * off).mean(0).real
+    best = int(np.argmax(follows))
+    if not follows[best] > 0 or np.exp(-len(row) * follows[best] ** 2) > level("error", len(follows)):
+        return found
+    return found._replace(told=np.column_stack([found.told[:, :2], turns[:, best] + off[:, best]]))
 
 
 def moves_of_means(case: Case) -> Moves | None:
@@ -65,7 +83,7 @@ def moves_of_means(case: Case) -> Moves | None:
     told = pose.minus(table.mean[:, at], before[:, at])
     truly = pose.minus(run.truth[row][:, at], run.truth[np.maximum(row - 1, 0)][:, at])
     fine = np.isfinite(told).all(1) & np.isfinite(truly).all(1) & (row > 0) & (table.step > case.first)
-    return Moves(table.step[fine], truly[fine], told[fine]) if fine.sum() >= _FEWEST else None
+    return _unwrapped(case, Moves(table.step[fine], truly[fine], told[fine])) if fine.sum() >= _FEWEST else None
 
 
 def turns_of_means(case: Case, window: float) -> tuple[str, Moves, Array] | None:
@@ -77,21 +95,27 @@ def turns_of_means(case: Case, window: float) -> tuple[str, Moves, Array] | None
     if len(parts) != 1 or len(tables) != 1 or run.labels or "mean" not in run.ends:
         return None
     ((name, at), table), space = (parts[0], tables[0]), SO3()
-    before, _ = case.sequence.before(table)
-    row, usual = np.searchsorted(run.step, table.step), float(np.median(np.diff(run.time)))
+    by = whole(case, table)
+    before, row, usual = by.before, np.searchsorted(run.step, by.step), float(np.median(np.diff(run.time)))
     n = max(1, round(window / max(usual, 1e-9)))
-    told = space.minus(table.mean[:, at], before[:, at])
-    fine = np.isfinite(told).all(1) & (row > 0) & (table.step > case.first)
+    told = space.minus(by.after[:, at], before[:, at])
+    fine = np.isfinite(told).all(1) & (row > 0) & (by.step > case.first)
+    rates = [case.space.at[k] for k, part in case.space.parts.items() if list(part.axis_units) == ["rad/s"] * 3]
+    for rate in rates:
+        by_state = before[fine, rate] * run.dt[row[fine], None]
+        if np.square(told[fine] - by_state).sum() < (1 - SURELY) * np.square(told[fine]).sum():
+            return None  # it turns as the state says, by a rate that readings have taught it
+    told -= by_biases(case, table, by, name)
     rows = np.flatnonzero(fine)[: fine.sum() // n * n].reshape(-1, n)
     rows = rows[row[rows[:, -1]] - row[rows[:, 0]] == n - 1]
     turn = quaternions.exp(told)
     about = quaternions.exp(quaternions.rotate(before[:, at], told))
-    whole, in_world = (_composed(q[rows]) for q in (turn, about))
+    turned, in_world = (_composed(q[rows]) for q in (turn, about))
     truly = space.minus(run.truth[row[rows[:, -1]]][:, at], run.truth[row[rows[:, 0]] - 1][:, at])
     known = np.isfinite(truly).all(1)
     if known.sum() < _FEWEST:
         return None
-    return name, Moves(table.step[rows[known, 0]], truly[known], whole[known]), in_world[known]
+    return name, Moves(by.step[rows[known, 0]], truly[known], turned[known]), in_world[known]
 
 
 def _composed(q: Array) -> Array:

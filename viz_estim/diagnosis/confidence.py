@@ -6,6 +6,7 @@ Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and Na
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import brentq
@@ -15,7 +16,7 @@ from viz_estim.core.distributions import chi2, norm
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis import tuning
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import GROSS, Finding, judge
+from viz_estim.diagnosis.finding import GROSS, ODDS, Finding, judge
 
 # A covariance too small by GROSS is an error, by less a warning; too large is never one: it costs, and misleads nobody.
 # S goes as the root of Q, as that of a random walk does in its steady state, P ≈ √(Q·R): Q may be wrong by its square.
@@ -27,6 +28,29 @@ _MOST, _MIDDLE = 0.2, 1.5
 
 
 def by_sensor(case: Case) -> Iterator[Finding]:
+    """The size of each sensor's innovations (`_by_sensor`); and where one sensor's are too large and another's too
+    small, whether their noises are exchanged, which must be likelier than any other factor on either, by ODDS."""
+    found = list(_by_sensor(case))
+    sizes = {f.sensor: f for f in found if f.sensor and f.evidence.get("gain_by_R") is not None}
+    for large, over in sizes.items():
+        for small, under in sizes.items():
+            if over.code == "overconfident" and under.code == "underconfident" and _as_many(case, large, small):
+                gains = [f.evidence[key] for f in (over, under) for key in ("gain_by_R", "gain_by_Q")]
+                if tuning.exchanged(case, large, small) > max(gains) + np.log(ODDS):
+                    told = (
+                        f"the noises of {large} and {small} are exchanged: with each other's R they would be about "
+                        f"as large as S says, where now those of {large} are too large and those of {small} too small",
+                        f"give {large} the noise of {small}, and {small} that of {large}",
+                    )
+                    found = [replace(f, cause=told[0], remedy=told[1]) if f in (over, under) else f for f in found]
+    yield from found
+
+
+def _as_many(case: Case, one: str, other: str) -> bool:
+    return case.sensors[one].dof == case.sensors[other].dof
+
+
+def _by_sensor(case: Case) -> Iterator[Finding]:
     """Mean NIS of a sensor outside its χ² band: the sum of N of them is χ²(N·dof) (eq. 5.4.2-9)."""
     spoken = False
     for name, readings in case.sensors.items():
@@ -83,16 +107,25 @@ def _by_process(case: Case) -> Iterator[Finding]:
             "overconfident" if over else "underconfident", severity, None, case.whole,
             {"factor_on_Q": factor, "log_likelihood_gain": gain, "p": p},
             f"the process noise Q is {factor if over else 1 / factor:.2g}× too {'small' if over else 'large'} by the "
-            "likelihood of the innovations, or the model lacks a motion",
-            _more_noise(factor),
+            f"likelihood of the innovations{_lacks_dt(tuned['Q'], case)}" + (", or the model lacks a motion" * over),
+            _more_noise(factor, tuned["Q"], case),
         )  # fmt: skip
 
 
-def _more_noise(factor: float) -> str:
-    return (
-        f"multiply Q by about {factor:.2g}, its standard deviations by {factor**0.5:.2g}; where the model lacks a "
-        "motion, add that to the state instead"
-    )
+def _lacks_dt(of: tuning.Tuned, case: Case) -> str:
+    """Whether Q is as much too large as one that is not multiplied by dt, or by dt²: as likely as the best, by ODDS."""
+    dt = case.run.dt[case.run.dt > 0]
+    usual = float(np.median(dt)) if len(dt) else 1.0
+    near = [k for k in (1, 2) if usual < 1 / GROSS and of.odds(usual**k) < ODDS]
+    powers = " or ".join(("dt", "dt²")[k - 1] for k in near)
+    return f", as one that is not multiplied by {powers} would be (dt is {usual:.3g} s)" if near else ""
+
+
+def _more_noise(factor: float, of: tuning.Tuned, case: Case) -> str:
+    more = f"multiply Q by about {factor:.2g}, its standard deviations by {factor**0.5:.2g}"
+    if _lacks_dt(of, case):
+        return f"{more}; or make it of the step's dt, by G·V·Gᵀ with dt in G where it is the noise of an input"
+    return f"{more}; where the model lacks a motion, add that to the state instead"
 
 
 def ljung_box(readings: Readings, lags: int = 10) -> float:
@@ -184,9 +217,10 @@ def _words(
     if process is not None:
         wrong = f"{process:.2g}× too small" if process > 1 else f"{1 / process:.2g}× too large"
         return (
-            f"{size}: the process noise Q is {wrong} (R alone would explain it less well), or the model misses what "
-            f"moves {name}",
-            _more_noise(process),
+            f"{size}: the process noise Q is {wrong} (R alone would explain it less well)"
+            f"{_lacks_dt(tuning.factors(case)['Q'], case)}"
+            + (f", or the model misses what moves {name}" if process > 1 else ""),
+            _more_noise(process, tuning.factors(case)["Q"], case),
         )
     if ratio > 1:
         by = "too small" if factor is None else f"{factor:.2g}× too small"

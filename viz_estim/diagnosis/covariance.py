@@ -9,13 +9,9 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.evidence import Case, tells_gain
-from viz_estim.diagnosis.finding import Finding
+from viz_estim.diagnosis.finding import GROSS, Finding
 
 _HALF = float(np.sqrt(np.finfo(float).eps))  # half of the digits: what is beyond is no rounding that piled up
-# The logarithm of what is claimed of a blind direction over the run. It is exactly 0 but for the transport, which is
-# right to second order in a correction: sound filters leave 1e-6. At 0.2 a σ is 10 % too small, which NEES of one
-# direction would take 300 independent errors to show; 0.02 is a tenth of that.
-_LEAK, _GREAT_LEAK = 0.02, 0.2
 
 
 def broken(case: Case) -> Iterator[Finding]:
@@ -185,7 +181,9 @@ def unobservable(case: Case) -> Iterator[Finding]:
 
     b is the blind direction before, and after it the same carried to the tangent space at the new mean. Their
     logarithms' differences are summed over the run: by what factor the information grew that no reading gave (Barrau
-    and Bonnabel 2017: what a filter claims to learn of a direction that is not observable).
+    and Bonnabel 2017: what a filter claims to learn of a direction that is not observable). No chance is in it: it is 0
+    but for the transport, which is right to second order in a correction and leaves 1e-6 in sound filters. Told is a
+    factor on the variance that as many errors as there are updates could tell, 1 + √(2/T); an error is GROSS.
     """
     run = case.run
     for table in run.stages.values():
@@ -205,12 +203,12 @@ def unobservable(case: Case) -> Iterator[Finding]:
             after = (carried @ b[rows][..., None])[..., 0]
             gained = np.log(_information(table.cov[rows], after) / _information(cov[rows], b[rows]))
             total = float(gained.sum())
-            if total > _LEAK:
+            if total > np.log1p(np.sqrt(2 / rows.sum())):
                 at = table.step[rows]
                 first = int(at[np.argmax(np.cumsum(gained) > 0.1 * total)])
                 evidence = {"information_factor": float(np.exp(min(total, 700.0))), "updates": int(rows.sum())}
                 yield Finding(
-                    "unobservable_update", "error" if total > _GREAT_LEAK else "warning", name,
+                    "unobservable_update", "error" if total > np.log(GROSS) else "warning", name,
                     (first, int(at[-1])), evidence,
                     f"updates by {name} make a direction surer that {name} cannot see (as heading, by gravity): over "
                     f"the run they claim {np.exp(min(total, 700.0)):.3g}× the information that there was",

@@ -69,7 +69,12 @@ _ORDER: tuple[Severity, ...] = ("error", "warning", "note")
 
 _BUDGET: dict[Severity, float] = {"error": 1e-4, "warning": 0.05}  # false alarms a run
 GROSS = 2.0  # the factor on a variance from which on it is an error
-_FAMILIES = 30  # statistical checks: each has an equal share, and shares it out among what it tests
+SURELY = 0.95  # of a misfit explained: no error of a linearisation looks like that
+SHEET = 0.05  # of a factor: what a gyro's or a wheel's data sheet leaves to a calibration
+ODDS = (
+    20.0  # by which one cause must be likelier than another to be named alone: strong evidence (Kass and Raftery 1995)
+)
+_FAMILIES = 36  # statistical checks: each has an equal share, and shares it out among what it tests
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ class Against:
     error of r by the model of the sensor, in standard deviations of R. part: which of the sensor's parts it is, if it
     has several; exact: the model is the filter's own and no line along its Jacobian; attitude (M, d, d): the truth's,
     world from body, if a part of the state says it; places (m, d), position (M, d): of distances, from where the model
-    takes them to be, and to where.
+    takes them to be, and to where. by_control: the model takes the control.
     """
 
     name: str
@@ -41,6 +41,7 @@ class Against:
     attitude: Array | None
     places: Array | None = None
     position: Array | None = None
+    by_control: bool = False
 
     def pick(self, rows: slice | np.ndarray) -> Against:
         """Some of the readings."""
@@ -109,3 +110,31 @@ def fitted(one: Against, design: Array) -> Fitted:
     # In the least variance that explains the rest, so that an R that is too small does not count for a cause.
     gain = 0.5 * M * m * np.log(own / max(rest, 1e-300))
     return Fitted(beta, p, error, dof, gain, (own - rest) / max(own - min(M * m, rest), 1e-300))
+
+
+class Slope(NamedTuple):
+    """A slope through zero, its standard error and degrees of freedom, and Σ of the squares that are left."""
+
+    value: float
+    error: float
+    dof: float
+    left: float
+
+    def p_beyond(self, size: float) -> float:
+        """The chance of such a slope where it is of this size."""
+        return float(2 * t.sf(max(abs(self.value) - size, 0.0) / max(self.error, 1e-300), self.dof))
+
+
+def slope(y: Array, x: Array) -> Slope:
+    """Of y on x (M,), with a standard error by 20 stretches of the run where that is larger."""
+    A = float(x @ x)
+    if A <= 0:
+        return Slope(0.0, 1.0, 1.0, float(y @ y))
+    slope = float(x @ y) / A
+    left = y - slope * x
+    pieces = np.array([part.sum() for part in np.array_split(x * left, min(STRETCHES, len(y) // 5))])
+    B = len(pieces)
+    scatter, model = float(pieces @ pieces) * B / (B - 1) / A**2, float(left @ left) / len(y) / A
+    if scatter < model * chi2.isf(0.01, B - 1) / (B - 1):
+        return Slope(slope, float(np.sqrt(model)), len(y) - 1, float(left @ left))
+    return Slope(slope, float(np.sqrt(scatter)), B - 1, float(left @ left))

@@ -50,7 +50,8 @@ def _turn(one: Against, left: float, k: int, turn: str, words: str) -> Iterator[
     own, (M, m) = float((white(one, one.r) ** 2).sum()), one.r.shape
     gain, explained = 0.5 * M * m * float(np.log(own / max(left, 1e-300))), 1 - left / max(own, 1e-300)
     yield Cause(
-        "units_or_axes", gain, k, _penalised(gain, k, M), own > GROSS * left, float(np.sqrt(own / (M * m))), explained,
+        "units_or_axes", gain, k, _penalised(gain, k, M), own > GROSS * left,
+        float(np.sqrt(max(own - left, 0.0) / (M * m))), explained,
         {"map": f"turned by {turn}", "log_likelihood_gain": gain},
         f"readings of {one.label} are turned by {turn} against the truth{words or ': they are in another frame'}",
         f"turn the readings of {one.label} back into the frame that h(x) is in, or put that rotation into h(x)", True,
@@ -127,7 +128,8 @@ def misplaced(one: Against) -> Iterator[Cause]:
         at, taken = (f"({', '.join(f'{v:.3g}' for v in p)}) m" for p in (place, one.places[i]))
         yield Cause(
             "units_or_axes", gain, d, _penalised(gain, d, M),
-            bool(own.sum() > GROSS * left), float(np.sqrt(own[i] / M)), 1 - left / max(float(own.sum()), 1e-300),
+            bool(own.sum() > GROSS * left), float(np.sqrt(max(float(own.sum()) - left, 0.0) / M)),
+            1 - left / max(float(own.sum()), 1e-300),
             {"map": f"place {at}", "log_likelihood_gain": gain},
             f"readings of {one.axis(i)} are distances from {at}, and the filter takes them from {taken}",
             f"check the place of what {one.axis(i)} is read from, and the order of the places", True,

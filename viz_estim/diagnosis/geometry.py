@@ -106,5 +106,7 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
             if value < best:
                 best, what = value, title
         gain, explained = 0.5 * (own - best), 1 - best / max(own, 1e-300)
-        if gain > -np.log(level("error", 60 * len(case.sensors))) and explains(what, explained):
+        nothing = float(np.einsum("ti,tij,tj->", z, precision, z))
+        sure = gain > -np.log(level("error", 60 * len(case.sensors)))
+        if sure and explains(what, own, best, nothing, z.size):
             yield finding_of(name, readings.steps, what, explained, gain)

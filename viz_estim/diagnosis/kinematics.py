@@ -10,16 +10,16 @@ from viz_estim.core import quaternions
 from viz_estim.core.distributions import t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3
-from viz_estim.diagnosis.axes import explains, finding_of, maps
+from viz_estim.diagnosis.axes import explains, finding_of, maps, units
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import Finding, judge, level
+from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, Finding, judge, level
 from viz_estim.diagnosis.fits import STRETCHES
+from viz_estim.diagnosis.naming import likeliest, of_motion
 from viz_estim.diagnosis.sensors import Imu, imu
 from viz_estim.scenarios.imu_health import GRAVITY
 
 _WINDOW = 0.1  # s over which gravity's turn is compared with the gyro's
 _DEPENDENT = 4  # windows that share one push of the hand
-_SHEET = 0.05  # of a sensitivity
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -52,16 +52,18 @@ def imu_axes(case: Case) -> Iterator[Finding]:
     nothing = float(np.square(change).sum())  # what no turn at all would leave: a map that is no better is none
     if gain > -np.log(level("error", 2 * len(candidates))):
         blamed = _blamed(case, both)
-        if blamed == "accel" and min(of_force) < 1.5 * least:
+        # Another map of the other sensor, where that is as likely: their windows share pushes of the hand.
+        alike = 0.5 * change.size / _DEPENDENT * np.log(min(of_force) / max(least, 1e-300)) < np.log(ODDS)
+        if blamed == "accel" and alike:
             name, what = "accel", candidates[int(np.argmin(of_force))][0]
         else:
             name, what = "gyro", candidates[int(np.argmin(of_rate))][0]
-        if explains(what, explained) and least < 0.5 * nothing:
+        if explains(what, own, least, nothing, change.size // _DEPENDENT) and nothing > GROSS * least:
             yield finding_of(name, steps, what, explained, gain)
-    if not 0.5 < length / GRAVITY < 2:
-        factor = min((abs(np.log(length * M[0, 0] / GRAVITY)), t) for t, M in maps(3, "m/s²") if t[:4] != "axes")
-        if factor[0] < 0.2:
-            yield finding_of("accel", steps, factor[1], 1 - abs(1 - np.exp(factor[0])), float(len(both.rows)))
+    if not 1 / GROSS < length / GRAVITY < GROSS:  # a hand pulls by less than gravity, in the middle over a run
+        for what in likeliest(length / GRAVITY, {name: 1 / value for name, value in units("m/s²").items()})[:1]:
+            left = abs(np.log(length / GRAVITY * units("m/s²")[what]))
+            yield finding_of("accel", steps, what, float(np.exp(-left)), float(len(both.rows)))
 
 
 def scale(case: Case) -> Iterator[Finding]:
@@ -84,10 +86,12 @@ def scale(case: Case) -> Iterator[Finding]:
     if severity and s > 0:
         k = next(k for k, one in enumerate(found) if one[1] == p)
         which = "gyro" if k == 0 else f"gyro's {'xyz'[k - 1]}"
+        names = likeliest(1 / s, of_motion("rad", 0.0))
+        as_if = f": {', or '.join(names)}" if names else ": its sensitivity is another one"
         yield Finding(
             "units_or_axes", severity, "gyro", steps,
             {"map": f"a factor of {1 / s:.3g}", "p": p, "factors": [1 / one[0] for one in found]},
-            f"the {which} reads {1 / s:.3g}× the turn that gravity shows: its sensitivity is another one",
+            f"the {which} reads {1 / s:.3g}× the turn that gravity shows{as_if}",
             f"divide the {which} by {1 / s:.3g}, or calibrate it (`viz-estim calibrate imu`)",
         )  # fmt: skip
 
@@ -103,7 +107,7 @@ def _slopes(X: Array, change: Array) -> list[tuple[float, float]]:
     parts = np.array([part.sum(0) for part in np.array_split(scores, STRETCHES)])
     robust = inverse @ (parts.T @ parts) @ inverse * STRETCHES / (STRETCHES - 1)
     error = np.sqrt(np.maximum(np.diag(robust), np.finfo(float).tiny))
-    p = 2 * t.sf(np.maximum(np.abs(s - 1) - _SHEET, 0) / error, STRETCHES - 1)
+    p = 2 * t.sf(np.maximum(np.abs(s - 1) - SHEET, 0) / error, STRETCHES - 1)
     return list(zip(s.tolist(), p.tolist(), strict=True))
 
 

@@ -23,7 +23,6 @@ _LARGE = GROSS**0.5 - 1
 # Of the squares of what a sampled prediction leaves, n' − n of two draws, the motion in between holds n and not n': it
 # explains at most a half, while it explains all that a wrong Jacobian leaves.
 _HALF = 0.5
-_UNFELT = 0.05  # of Q's variance
 _FEWEST = 10
 
 
@@ -87,8 +86,8 @@ def predicted(case: Case) -> Iterator[Finding]:
     """F against how the prediction changes with the state, and whether what is left looks like a sample of Q.
 
     Only between steps with the same control and dt. What is left, r, is whitened by 2Q: r of a deterministic prediction
-    is 0 beyond its bound; with a sample of the noise it is N(0, 2Q), so that rᵀ(2Q)⁺r is the rank of Q in the mean. A
-    sample of less than 5 % of Q's variance is not told: the run's own NIS would take 800 readings to show it.
+    is 0 beyond its bound; with a sample of the noise it is N(0, 2Q), so that rᵀ(2Q)⁺r is the rank of Q in the mean.
+    Told is a sample of a share of Q's variance that as many draws can tell, √(2/N) of N numbers.
     """
     run = case.run
     for table in run.stages.values():
@@ -110,12 +109,13 @@ def predicted(case: Case) -> Iterator[Finding]:
         held = values > 1e-12 * np.maximum(values[:, -1:], 1e-300)
         white = np.einsum("mij,mi->mj", vectors, rest) / np.sqrt(np.where(held, values, np.inf))
         ratio = float(np.median((white**2).sum(1) / np.maximum(held.sum(1), 1)))
+        unfelt = np.sqrt(2 / max(int(held.sum()), 1))
         drift = _follows(rest, moved)
         told = "control" in run.inputs  # else the prediction may follow what the recording does not hold
         largest = float(np.abs(table.mean).max())
         left, count = _left(change - moved, expected - moved, may, largest)
         size = np.median(np.linalg.norm(rest, axis=1))
-        if size > 1e6 * np.finfo(float).eps * max(largest, 1.0) and ratio > _UNFELT and drift < _HALF:
+        if size > 1e6 * np.finfo(float).eps * max(largest, 1.0) and ratio > unfelt and drift < _HALF:
             evidence = {"size_in_Q": ratio, "stage": table.name}
             yield Finding(
                 "noisy_prediction", "error", None, steps, evidence,
@@ -123,7 +123,7 @@ def predicted(case: Case) -> Iterator[Finding]:
                 "of the process noise is added to it",
                 "predict the mean by the model alone; the noise enters the covariance, as + Q",
             )  # fmt: skip
-        elif (drift > _HALF or (told and ratio <= _UNFELT)) and (severity := _severity(left, count * change.shape[1])):
+        elif (drift > _HALF or (told and ratio <= unfelt)) and (severity := _severity(left, count * change.shape[1])):
             yield _wrong("F", severity, None, steps, left, "the process model f(x)")
 
 

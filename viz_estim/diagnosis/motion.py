@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
-from viz_estim.core.distributions import chi2, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, wrap
-from viz_estim.diagnosis import clouds
+from viz_estim.diagnosis import clouds, forces
 from viz_estim.diagnosis.against import FEWEST
 from viz_estim.diagnosis.against import slip as bound
 from viz_estim.diagnosis.axes import maps
-from viz_estim.diagnosis.causes import named
+from viz_estim.diagnosis.durations import composed, whole
 from viz_estim.diagnosis.evidence import Case, transitions
-from viz_estim.diagnosis.finding import GROSS, Finding, judge
-from viz_estim.diagnosis.fits import STRETCHES
+from viz_estim.diagnosis.finding import GROSS, SHEET, SURELY, Finding, judge
+from viz_estim.diagnosis.fits import slope
+from viz_estim.diagnosis.naming import likeliest, named, of_motion
 
-SURELY = 0.95  # of the misfit explained: no error of a linearisation looks like that
-_SHEET = 0.05  # of a motion: what the data sheet of a wheel or a gyro leaves to a calibration
 _WORLD = "the world's axes"
 _ALIKE = 1.01  # of the squares that are left: as well explained
 
@@ -41,8 +38,8 @@ def prediction(case: Case) -> Iterator[Finding]:
     moves = [(table, F) for table in run.stages.values() if (F := transitions(case, table)) is not None]
     if not np.isfinite(run.truth).any():
         return
-    if turned := list(_turned(case)):
-        yield from map(_by_estimate, turned)
+    if by_imu := [*forces.forces(case), *_turned(case)]:  # by an accelerometer, by a gyro, or by both
+        yield replace(by_imu[0], cause="; and ".join(f.cause for f in by_imu))
         return
     moved = clouds.moves_of_means(case)
     if moved is not None and (exchanged := _exchanged(moved.truly, moved.told, moved.step)) is not None:
@@ -52,11 +49,12 @@ def prediction(case: Case) -> Iterator[Finding]:
         yield from map(_by_estimate, _elsewhere(case))
         return
     (table, F), row = moves[0], {int(step): k for k, step in enumerate(run.step)}
-    before, _ = case.sequence.before(table)
-    at = np.array([row[int(step)] for step in table.step])
-    ok = (at > 0) & (table.step > case.first)
+    by = whole(case, table)
+    before, step, F = by.before, by.step, composed(F, by)
+    at = np.array([row[int(k)] for k in step])
+    ok = (at > 0) & (step > case.first)
     now, past = run.truth[at], run.truth[np.maximum(at - 1, 0)]
-    error, after = case.space.minus(past, before), case.space.minus(now, table.mean)
+    error, after = case.space.minus(past, before), case.space.minus(now, by.after)
     needed = np.asarray((np.abs(np.nan_to_num(F)) > 1e-12).any(0))
     d = len(case.space.axes)
     told_of: list[tuple[float, Finding]] = []
@@ -75,11 +73,11 @@ def prediction(case: Case) -> Iterator[Finding]:
         slip = bound(F[known][:, i : i + 1], np.nan_to_num(error[known]), before[known], case.space)
         near = np.isfinite(slip) & (dt > 0)
         if near.sum() >= FEWEST:
-            of = table.step[known][near]
+            of = step[known][near]
             moving[i] = told[near] + w[near], told[near], of
             axis, unit = case.space.axes[i].rpartition(".")[2], case.space.axis_units[i]
             label = name if axis in ("", name, "angle") else f"{name} {axis}"
-            told_of += _moves_as(label, unit, of, w[near], told[near], dt[near], slip[near], 2 * d)
+            told_of += _moves_as(label, unit, of, w[near], told[near], dt[near], slip[near], 2 * d, by.times)
     for name, part in case.space.parts.items():
         axes = range(case.space.axes_at[name].start, case.space.axes_at[name].stop)
         if isinstance(part, SO3) and all(i in moving and len(moving[i][0]) == len(moving[axes[0]][0]) for i in axes):
@@ -129,7 +127,9 @@ def _of_a_cloud(case: Case, carried: clouds.Moves) -> Iterator[Finding]:
         return
     none = np.zeros(int(rows.sum()))
     told_of: list[tuple[float, Finding]] = []
-    for i, (label, unit) in enumerate((("the way ahead", "m"), ("the way to the left", "m"), ("heading", "rad"))):
+    for i, label, unit in ((2, "heading", "rad"), (0, "the way ahead", "m"), (1, "the way to the left", "m")):
+        if i == 1 and any(f.severity == "error" for _, f in told_of):
+            continue  # it goes to the left by how it turns and how far ahead it goes
         told, truly = carried.told[rows, i], carried.truly[rows, i]
         told_of += _moves_as(label, unit, carried.step[rows], truly - told, told, dt[rows], none, 6)
     yield from _best(told_of)
@@ -165,11 +165,17 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Ar
     predicted in the world's axes (M, 3)."""
     own = float(np.square(truly - told).sum())
     # In what was predicted, whose size stays as it is: a unit that makes it small explains nothing by that.
-    tried = [(float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title) for title, A in maps(3, "rad/s")]
+    tried = [
+        (float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title, told @ A.T) for title, A in maps(3, "rad/s")
+    ]
     if in_world is not None:
-        tried.append((float(np.square(truly - in_world).sum()), _WORLD))
-    best, what = min(tried)
+        tried.append((float(np.square(truly - in_world).sum()), _WORLD, in_world))
+    best, what, mapped = min(tried, key=lambda one: one[0])
     gain, explained = 0.5 * truly.size * np.log(own / max(best, 1e-300)), 1 - best / max(own, 1e-300)
+    # Either way, so that noise of neither passes for a unit that makes it small.
+    back = float(np.square(truly - mapped).sum())
+    if what != _WORLD and not (forces.foreseen(told, best) and forces.foreseen(truly, back)):
+        return None
     least = SURELY if in_world is None else 1 - 1 / GROSS
     if explained < least or judge(float(np.exp(-min(gain, 700.0))), 60, large=True) != "error":
         return None
@@ -191,7 +197,7 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Ar
 
 
 def _moves_as(
-    label: str, unit: str, of: np.ndarray, w: Array, told: Array, dt: Array, slip: Array, tests: int
+    label: str, unit: str, of: np.ndarray, w: Array, told: Array, dt: Array, slip: Array, tests: int, times: int = 1
 ) -> Iterator[tuple[float, Finding]]:
     """w = (c − 1)·Δ' + b·dt: which of the two is off, if any. By rates, so that a long step counts like others. Large
     is what is more than 5 % of the motion off, for sure.
@@ -201,7 +207,7 @@ def _moves_as(
     """
     w, told, slip = w / dt, told / dt, slip / dt
     one, truly = np.ones_like(told), told + w
-    steady, forth, aback = _slope(w, one), _slope(w, told), _slope(-w, truly)
+    steady, forth, aback = slope(w, one), slope(w, told), slope(-w, truly)
     drift, beta, back, left_drift, left_factor = steady.value, forth.value, aback.value, steady.left, forth.left
     ends = 1 / (1 + beta) if beta != -1 else np.inf, 1 + back
     by_factor = left_factor < left_drift
@@ -214,27 +220,20 @@ def _moves_as(
         if (ends[0] - 1) * (ends[1] - 1) <= 0:
             return
         # Of what is predicted, against what happens: the end that has a name, or the more careful one.
-        known = [f for f in ends if named(f, unit) != named(1.3, unit)]
-        factor = known[0] if known else min(ends, key=lambda f: abs(f - 1))
+        told_as = of_motion(unit, float(np.median(dt)), times)
+        both = (ends[0], forth.error * ends[0] ** 2), (ends[1], aback.error)
+        known = [(f, error) for f, error in both if likeliest(f, told_as, error)]
+        factor, error = known[0] if known else min(both, key=lambda one: abs(one[0] - 1))
         p = max(forth.p_beyond(0.0), aback.p_beyond(0.0))
-        severity = judge(p, tests, large=max(forth.p_beyond(_SHEET), aback.p_beyond(_SHEET)))
-        sign = (
-            "its sign is wrong"
-            if abs(factor + 1) < 0.2
-            else "a dt that is multiplied once too often"
-            if abs(factor / float(np.median(dt)) - 1) < 0.1
-            else named(factor, unit)
-            if factor > 0
-            else "a wrong sign and size"
-        )
-        cause = f"{label} is predicted to move by {factor:.3g}× what it does: {sign}"
+        severity = judge(p, tests, large=max(forth.p_beyond(SHEET), aback.p_beyond(SHEET)))
+        cause = f"{label} is predicted to move by {factor:.3g}× what it does: {named(factor, told_as, error)}"
         remedy = (
             f"look at the control that moves {label}: its sign, its unit, its calibration (divide it by {factor:.3g})"
         )
         evidence: dict[str, object] = {"component": label, "factor": factor, "p": p}
     else:
         p_drift = steady.p_beyond(0.0)
-        severity = judge(p_drift, tests, large=steady.p_beyond(_SHEET * float(np.abs(told).mean())))
+        severity = judge(p_drift, tests, large=steady.p_beyond(SHEET * float(np.abs(told).mean())))
         rate = f"{unit}²" if unit.endswith("/s") else f"{unit}/s"
         cause = (
             f"the prediction misses a steady {drift:+.3g} {rate} of {label}: the control that moves it has a bias, "
@@ -246,31 +245,3 @@ def _moves_as(
         evidence = {"component": label, "drift": drift, "p": p_drift}
     if severity:
         yield share, Finding("process_model", severity, None, steps, evidence | {"against": "truth"}, cause, remedy)
-
-
-class Slope(NamedTuple):
-    """A slope through zero, its standard error and degrees of freedom, and Σ of the squares that are left."""
-
-    value: float
-    error: float
-    dof: float
-    left: float
-
-    def p_beyond(self, size: float) -> float:
-        """The chance of such a slope where it is of this size."""
-        return float(2 * t.sf(max(abs(self.value) - size, 0.0) / max(self.error, 1e-300), self.dof))
-
-
-def _slope(y: Array, x: Array) -> Slope:
-    """Of y on x (M,), with a standard error by 20 stretches of the run where that is larger."""
-    A = float(x @ x)
-    if A <= 0:
-        return Slope(0.0, 1.0, 1.0, float(y @ y))
-    slope = float(x @ y) / A
-    left = y - slope * x
-    pieces = np.array([part.sum() for part in np.array_split(x * left, min(STRETCHES, len(y) // 5))])
-    B = len(pieces)
-    scatter, model = float(pieces @ pieces) * B / (B - 1) / A**2, float(left @ left) / len(y) / A
-    if scatter < model * chi2.isf(0.01, B - 1) / (B - 1):
-        return Slope(slope, float(np.sqrt(model)), len(y) - 1, float(left @ left))
-    return Slope(slope, float(np.sqrt(scatter)), B - 1, float(left @ left))

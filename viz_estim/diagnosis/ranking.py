@@ -29,17 +29,30 @@ def ranked(found: list[Finding]) -> list[Finding]:
         others = [f.code == "biased_innovation" and "bias" not in f.evidence for f in found]
         found = [_softened(f, best) if other else f for f, other in zip(found, others, strict=True)]
     found = [_of_the_noise(f, found) if f.code == "start" else f for f in found]
+    found = _as_large_as_their_errors(found)
     errors = [f for f in found if f.severity == "error" and f.code != "sensor_silent"]
     first = sorted(errors, key=lambda finding: finding.tier)  # the cause at the root is what is to be mended
     return [_softened(f, next((c for c in first if _follows(f, c)), None)) for f in found]
 
 
+def _as_large_as_their_errors(found: list[Finding]) -> list[Finding]:
+    """Information from nowhere is no matter of chance, and an error where only what follows from it is one."""
+    errors = [f for f in found if f.severity == "error"]
+    if not errors or any(f.code not in SYMPTOMS for f in errors):
+        return found
+    of = {f.sensor for f in errors}
+    claims = [
+        f.code == "unobservable_update" and f.severity == "warning" and bool({f.sensor, None} & of) for f in found
+    ]
+    return [replace(f, severity="error") if claim else f for f, claim in zip(found, claims, strict=True)]
+
+
 def _of_the_noise(start: Finding, found: list[Finding]) -> Finding:
     """A start that was made of readings is as far off as their R is too small: then that is the cause."""
     for f in found:
-        factor, white = f.evidence.get("factor_on_R"), abs(f.evidence.get("autocorrelation", 1.0)) < 0.2
+        factor, by_R = f.evidence.get("factor_on_R"), f.evidence.get("gain_by_R", 0.0)
         held = factor and chi2.sf(start.evidence["nees"] / factor, start.evidence["dof"]) > 0.01
-        if f.code == "overconfident" and white and held:
+        if f.code == "overconfident" and held and by_R >= f.evidence.get("gain_by_Q", 0.0):
             return _softened(start, f)
     return start
 
@@ -53,10 +66,17 @@ def _follows(finding: Finding, cause: Finding) -> bool:
         return True
     if cause.code in _SENT and finding.evidence.get("against") == "truth":
         return False
+    if finding.code == "start" and cause.code == "units_or_axes" and _of_readings(cause):
+        return True  # which it may be made of
     if finding.code == "process_model" and _of_the_gyro(cause):
         return True  # which moves the prediction
     if cause.code == "process_model" and _of_the_gyro(finding):
         return False
+    if "by_control" in finding.evidence and cause.code == "process_model" and "map" in cause.evidence:
+        return True  # which a model of readings takes too
+    by_innovations = finding.code == "units_or_axes" and "against" not in finding.evidence and not _of_the_gyro(finding)
+    if by_innovations and cause.code == "process_model" and "by_estimate" not in cause.evidence:
+        return True  # which sends the estimate elsewhere, so that readings look as if of another unit
     if "by_estimate" in finding.evidence and _of_readings(cause):
         return True
     if "by_estimate" in cause.evidence and _of_readings(finding):

@@ -19,7 +19,6 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import S2, SE2, SO2, SO3, Euclidean, Product, Space
 from viz_estim.recording.layout import leaves
 
-_EXACT = 0.1  # of R's standard deviation, as the root mean square: what a hundred readings would tell
 _ROWS = 3  # pairs for each number of a fit, at least
 _SEEN = 1e-9  # of the largest singular value: a direction in which the estimates never moved tells nothing
 
@@ -31,6 +30,7 @@ class Recovered(NamedTuple):
     slip: Array
     places: Array | None = None  # (m, d): of distances, from where
     position: Array | None = None  # (M, d): the truth's, to which the distances are
+    by_control: bool = False  # whether it takes the control, as of a place off the origin that turns with the body
 
 
 def recovered(
@@ -44,18 +44,27 @@ def recovered(
     for _, leaf, at in own:
         if type(leaf) is type(part) and leaf.axis_units == part.axis_units and len(leaf.names) == len(part.names):
             off = np.sqrt(np.mean((part.minus(predicted, mean[:, at]) / std) ** 2))
-            if off < _EXACT:
+            if off < exact(len(mean)):
                 return Recovered(truth[:, at], np.where(np.isfinite(truth[:, at]).all(1), off, np.inf))
     if isinstance(part, Euclidean | S2):
         std = std if len(std) == predicted.shape[1] else np.full(predicted.shape[1], std.mean())
         if set(part.axis_units) == {"m"} and (found := _distances(own, mean, truth, predicted, std)) is not None:
             return found
-        fits = [one for kind in _kinds(own, control) if (one := _by(kind, mean, truth, predicted, std)) is not None]
+        fits = [
+            one._replace(by_control=steered)
+            for kind, steered in _kinds(own, control)
+            if (one := _by(kind, mean, truth, predicted, std)) is not None
+        ]
         best = min(fits, key=lambda one: float(np.median(one.slip)), default=None)  # many numbers fit any few pairs
         if best is not None and isinstance(part, S2):
             return best._replace(true=best.true / np.linalg.norm(best.true, axis=1, keepdims=True))
         return best
     return None
+
+
+def exact(count: int) -> float:
+    """Of R's standard deviation, as a root mean square: less than what so many readings would tell of a mean."""
+    return float(1 / np.sqrt(count))
 
 
 def _by(kind: Callable[[Array], Array], mean: Array, truth: Array, y: Array, std: Array) -> Recovered | None:
@@ -64,7 +73,7 @@ def _by(kind: Callable[[Array], Array], mean: Array, truth: Array, y: Array, std
         return None
     true, fitted, leverage, _ = line
     off = np.sqrt(np.mean(((fitted - y) / std) ** 2))
-    return Recovered(true, off * (1 + leverage)) if off < _EXACT else None
+    return Recovered(true, off * (1 + leverage)) if off < exact(len(y)) else None
 
 
 def _distances(
@@ -83,15 +92,38 @@ def _distances(
         rest, fitted, leverage, coefficients = line
         squared = np.maximum(fitted + (p**2).sum(1, keepdims=True), 0.0)
         off = np.sqrt(np.mean(((np.sqrt(squared) - d) / std) ** 2))
-        if off < _EXACT:
+        if off < exact(len(d)):
             true = np.sqrt(np.maximum(rest + (q**2).sum(1, keepdims=True), 0.0))
             place = -0.5 * coefficients[:-1].T
             return Recovered(true, off * (1 + leverage), place, q)
     return None
 
 
-def _kinds(own: list[tuple[str, Space, slice]], control: Array | None) -> Iterator[Callable[[Array], Array]]:
-    """Straight lines in the state's plain numbers, in a rotation's entries, and in vectors seen from the body."""
+def distance_place(position: Array, beside: Array, d: Array) -> Array | None:
+    """The place (k,) from which d (M,) are s·|p − L| + b of positions p (M, k), the scale s and the bias b each one of
+    other numbers of the state (M, q), or none; None where no such place gives them to a thousandth."""
+    one, none = np.ones(len(d)), np.zeros(len(d))
+    for b in [none, *beside.T]:
+        for s in [one, *beside.T]:
+            if (s == 0).any() or s is b:
+                continue
+            own = (d - b) / s
+            line = _line(_affine(position), own**2 - (position**2).sum(1), _affine(position))
+            if line is None:
+                return None
+            _, fitted, _, coefficients = line
+            off = np.sqrt(np.maximum(fitted + (position**2).sum(1), 0.0)) - own
+            if np.sqrt(np.mean(off**2)) < 1e-3 * np.std(own) and (own > 0).all():
+                return np.asarray(-0.5 * coefficients[:-1])
+    return None
+
+
+def _kinds(
+    own: list[tuple[str, Space, slice]], control: Array | None
+) -> Iterator[tuple[Callable[[Array], Array], bool]]:
+    """Straight lines in the state's plain numbers, in a rotation's entries, and in vectors seen from the body; and
+    whether the control is among their numbers."""
+    steered = control is not None
     plain = [at for _, leaf, at in own if isinstance(leaf, Euclidean)]
     turns = [at for _, leaf, at in own if isinstance(leaf, SO3)]
     headings = [at for _, leaf, at in own if isinstance(leaf, SO2)]
@@ -99,21 +131,25 @@ def _kinds(own: list[tuple[str, Space, slice]], control: Array | None) -> Iterat
     def numbers(x: Array) -> Array:
         return _affine(np.concatenate([x[:, at] for at in plain], axis=1)) if plain else np.ones((len(x), 1))
 
-    yield numbers
+    yield numbers, False
     for turn in turns:
-        yield lambda x, turn=turn: quaternions.to_matrix(x[:, turn]).reshape(len(x), 9)  # type: ignore[misc]
+        yield lambda x, turn=turn: quaternions.to_matrix(x[:, turn]).reshape(len(x), 9), False  # type: ignore[misc]
         for at in plain:
             if at.stop - at.start == 3:
                 # The body's rate, by which a place off its origin moves, is the control's or a part of the state.
-                yield lambda x, turn=turn, at=at: _seen(x, turn, at, control)  # type: ignore[misc]
+                yield lambda x, turn=turn, at=at: _seen(x, turn, at, control), steered  # type: ignore[misc]
                 yield (
                     lambda x, turn=turn, at=at: np.concatenate(  # type: ignore[misc]
                         [_seen(x, turn, at, control), numbers(x)[:, :-1]], axis=1
-                    )
+                    ),
+                    steered,
                 )
     for heading in headings:
-        yield lambda x, heading=heading: np.concatenate(  # type: ignore[misc]
-            [numbers(x), np.cos(x[:, heading]), np.sin(x[:, heading])], axis=1
+        yield (
+            lambda x, heading=heading: np.concatenate(  # type: ignore[misc]
+                [numbers(x), np.cos(x[:, heading]), np.sin(x[:, heading])], axis=1
+            ),
+            False,
         )
 
 
@@ -131,7 +167,7 @@ def _line(x: Array, y: Array, at: Array) -> tuple[Array, Array, Array, Array] | 
     """Least squares of y (M, k) on x (M, f): the line at other rows (M, f), at its own, and how far the others lie from
     these, √(aᵀ(XᵀX/M)⁻¹a) (M,), and its coefficients; infinitely far where they lie in a direction that no row of x
     tells of, or are not known."""
-    rows = np.asarray(np.isfinite(x).all(1) & np.isfinite(y).all(1))
+    rows = np.asarray(np.isfinite(x).all(1) & np.isfinite(y.reshape(len(y), -1)).all(1))
     if rows.sum() < _ROWS * x.shape[1]:
         return None
     size = np.maximum(np.abs(x[rows]).max(0), 1e-300)
@@ -144,4 +180,5 @@ def _line(x: Array, y: Array, at: Array) -> tuple[Array, Array, Array, Array] | 
     beside = np.linalg.norm(a @ Vt[~told].T, axis=1) > 1e-6 * np.linalg.norm(a, axis=1)
     own = np.where(rows[:, None], x, 0.0) / size @ coefficients
     far = np.where(known & ~beside, leverage, np.inf)
-    return a @ coefficients, np.where(rows[:, None], own, y), far, coefficients / size[:, None]
+    scaled = coefficients / (size[:, None] if coefficients.ndim > 1 else size)
+    return a @ coefficients, np.where(rows[:, None] if y.ndim > 1 else rows, own, y), far, scaled

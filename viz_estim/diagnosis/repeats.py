@@ -13,6 +13,7 @@ from viz_estim.diagnosis.sensors import continuous, given, runs
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.reader import Run
 
+_FEWEST = 10  # of readings of 52 bits: by then they are the same in all but name
 _HELD = "a reading is held and given again until the next one comes"
 
 
@@ -53,6 +54,29 @@ def used_twice(run: Run) -> Iterator[Finding]:
             doubled = float((np.diff(run.time)[np.maximum(rows[at] - 1, 0)] == 0).mean()) > 0.5
             how = "samples are in the log twice, with one stamp" if doubled else _HELD
             yield _twice(name, steps_held, len(at), how)
+
+
+def one_for_two(run: Run) -> Iterator[Finding]:
+    """Two components that are the same number at every tick: one reading is given as both, for no chance makes two
+    readings as fine as a float equal."""
+    whole = {name: values for name, values in run.inputs.items() if name.startswith("z.")}
+    columns = [
+        (name[2:] + (f" {i + 1}" if values.shape[1] > 1 else ""), values[:, i])
+        for name, values in whole.items()
+        for i in range(values.shape[1])
+        if continuous(values[np.isfinite(values).all(1)][:, [i]])
+    ]
+    for k, (name, values) in enumerate(columns):
+        for other, others in columns[:k]:
+            both = np.flatnonzero(np.isfinite(values) & np.isfinite(others))
+            if len(both) >= _FEWEST and (values[both] == others[both]).all():
+                yield Finding(
+                    "used_twice", "error", name.partition("/")[0].partition(" ")[0],
+                    (int(run.step[both[0]]), int(run.step[both[-1]])), {"times": len(both), "of": [other, name]},
+                    f"the readings of {other} and {name} are the same number at all of {len(both)} ticks: one is "
+                    "given as both",
+                    f"check the columns or indices from which {other} and {name} are read",
+                )  # fmt: skip
 
 
 def _twice(name: str, steps: tuple[int, int], count: int, how: str) -> Finding:

@@ -18,15 +18,13 @@ import numpy as np
 from viz_estim.core.distributions import chi2, norm, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
+from viz_estim.diagnosis import tuning
 from viz_estim.diagnosis.evidence import Case, jacobians, once, parameter, tells_gain, transitions
 from viz_estim.diagnosis.finding import Finding, judge
 from viz_estim.recording.tables import StageTable
 
 _BACK = 3  # readings over which a rate of change is taken: backwards, so that it is known before the innovation
 _STRETCHES = 20
-# Of the innovations' excess over what they should be, at least, for a fault to be named as its cause. It chooses among
-# causes; of false alarms it can but take some away.
-_EXPLAINS = 0.2
 
 
 class Fault(NamedTuple):
@@ -55,12 +53,11 @@ class Fault(NamedTuple):
 def lags(case: Case) -> Iterator[Finding]:
     """A constant lag τ of a sensor: its readings are z(t − τ), off by −τ·ż. Large is more than half of a step."""
     found = _tested(case, "lag")
-    excess = _excess(case)
     for fault in found:
         tau, name = fault.size, fault.sensor
         interval = float(np.median(np.diff(case.run.time)))
         severity = judge(fault.p, len(found), large=fault.p_beyond(0.5 * interval))
-        if severity is None or fault.score**2 < _EXPLAINS * excess or abs(tau) < interval:
+        if severity is None or abs(tau) < interval or not _likelier(case, fault):
             continue  # less than a step is how the model takes its steps
         if abs(tau) > 0.1 * (case.run.time[-1] - case.run.time[0]):
             continue  # so long a lag is no matter of a rate
@@ -80,13 +77,12 @@ def biases(case: Case) -> Iterator[Finding]:
     Large is one that doubles the squared error with which the filter foresees the reading, as in `innovations.biased`.
     """
     found = _tested(case, "bias")
-    excess = _excess(case)
     told = set()
     for fault in sorted(found, key=lambda one: -abs(one.score)):
         name = fault.sensor.partition("/")[0]
         axis, unit = fault.kind.removeprefix("bias ").partition(" ")[::2]
         severity = judge(fault.p, len(found), large=fault.p_beyond(_foreseen(case, name, axis)))
-        if severity is None or name in told or fault.score**2 < _EXPLAINS * excess:
+        if severity is None or name in told or not _likelier(case, fault):
             continue
         told.add(name)
         known = parameter(case.run, f"{name}_bias")
@@ -113,9 +109,14 @@ def _foreseen(case: Case, name: str, axis: str) -> float:
     return max(float(np.mean(readings.cov[:, i, i] - readings.noise[:, i, i])), 0.0) ** 0.5
 
 
-def _excess(case: Case) -> float:
-    """By how much the sum of all NIS is above its mean."""
-    return max(0.0, sum(float(r.nis.sum()) - r.dof * len(r) for r in case.sensors.values()))
+def _likelier(case: Case, fault: Fault) -> bool:
+    """Whether the fault, with S as large as what it leaves, explains the innovations better than another R or Q does
+    (`tuning`): by the greater likelihood, of one number each."""
+    total = sum(float(r.nis.sum()) for r in case.sensors.values())
+    count = sum(r.dof * len(r) for r in case.sensors.values())
+    left = max(total - fault.score**2 * max(1.0, _misfit(case)), 1e-300)
+    gain = 0.5 * (total - count - count * np.log(left / count))
+    return bool(gain >= max((one.gain for one in tuning.factors(case).values()), default=0.0))
 
 
 def _tested(case: Case, kind: str) -> list[Fault]:

@@ -8,21 +8,19 @@ import numpy as np
 
 from viz_estim.core.distributions import norm
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.finding import Finding, level
+from viz_estim.diagnosis.finding import SHEET, Finding, level
 from viz_estim.recording.reader import Run
 
 _ROUNDING = 1e-9  # s: to what stamps are kept
 _MISSING = 1.5  # usual intervals: what is longer is nearer to two than to one, so that a sample is missing
-# Of the time that dt gets wrong, or of the interval that stamps jitter by: Q, which goes as dt, is as wrong. There is
-# no chance in either: a filter's dt is the stamps' difference or it is not, and jitter is a note.
-_LARGE = 0.05
 
 
 def stamps(run: Run) -> Iterator[Finding]:
     """What cannot be: stamps that go back or repeat, a dt that is not their difference by more than rounding.
 
-    dt and stamps are each rounded to the nanosecond, and a float of the stamp has its own last digit. What can be, by
-    its chance: gaps and jitter.
+    dt and stamps are each rounded to the nanosecond, and a float of the stamp has its own last digit. A dt that is off
+    by a share moves the state too far by that share: an error from SHEET of the whole time on, as of any scale. What
+    can be, by its chance: gaps and jitter.
     """
     interval = np.diff(run.time)
     if len(interval) < 3:
@@ -41,7 +39,7 @@ def stamps(run: Run) -> Iterator[Finding]:
     if len(other):
         wrong = np.abs(run.dt[other] - interval[other - 1])
         yield _finding(
-            run, other, "error" if wrong.sum() > _LARGE * np.abs(interval).sum() else "warning", "dt",
+            run, other, "error" if wrong.sum() > SHEET * np.abs(interval).sum() else "warning", "dt",
             f"the filter's dt is not the difference of the stamps (by up to {wrong.max():.3g} s), as if it were fixed",
             "use each step's own dt = time[k] − time[k−1]",
         )  # fmt: skip
@@ -78,12 +76,12 @@ def _jitter(run: Run, interval: Array, usual: float, rounding: float) -> Iterato
     """Stamps of a regular sensor that were taken on arrival: a late one makes its interval long and the next one short.
 
     Intervals of stamps kT + e, e white, have the autocorrelation −½ at lag 1; those of a sensor whose own times jitter
-    have 0, with the standard error 1/√N (Box and Jenkins 1970). A note where it is large, for the true times are known
-    better than the stamps.
+    have 0, with the standard error 1/√N (Box and Jenkins 1970): the likelier of the two is the nearer. A note where the
+    spread is SHEET of an interval, as which it would scale a motion: the true times are known better than the stamps.
     """
     held = interval[(interval > 0) & (interval < _MISSING * usual)]
     N, spread = len(held), float(held.std()) if len(held) else 0.0
-    if N < 50 or spread < max(_LARGE * usual, 10 * rounding):
+    if N < 50 or spread < max(SHEET * usual, 10 * rounding):
         return
     about = held - held.mean()
     rho = float((about[1:] * about[:-1]).sum() / (about**2).sum())

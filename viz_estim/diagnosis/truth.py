@@ -18,8 +18,9 @@ from viz_estim.diagnosis.evidence import Case, parameter
 from viz_estim.diagnosis.finding import Finding, Severity, judge
 from viz_estim.diagnosis.fits import Against
 
-_SMALL = 0.1  # of R's standard deviation: what a hundred readings would tell
-_SHARE = 0.2  # of what is off, at least; it chooses among causes, and of false alarms it can but take some away
+_SMALL = 0.1  # of R's standard deviation: a hundredth of the squares that noise alone has
+# Of what is off beyond the noise, at least; it chooses among causes, and of false alarms it can but take some away.
+_SHARE = 0.2
 
 
 def sensors(case: Case) -> Iterator[Finding]:
@@ -29,7 +30,9 @@ def sensors(case: Case) -> Iterator[Finding]:
     log-likelihood less ½·k·log M is told (Schwarz 1978), summed over the sensor's targets and parts, which one delay or
     one exchange concerns alike. p is of the t-test of the worst coefficient with a variance by 20 stretches of the run
     (Liang and Zeger 1986), so that truth and noise may be coloured. Large is a bias or a factor that doubles the
-    squared error with which the filter foresees the reading, and a lag beyond half of a step.
+    squared error with which the filter foresees the reading, and a lag beyond half of a step. A cause must be
+    larger than the model's own error, and than a tenth of the noise, which adds a hundredth to its squares: an effect
+    that is smaller matters to no filter.
     """
     those = against(case)
     tests = sum(len(one.space.axes) + 2 for one in those)
@@ -48,6 +51,7 @@ def sensors(case: Case) -> Iterator[Finding]:
         _, one, cause, severity = max(found[likeliest], key=lambda entry: entry[0])
         steps = int(one.step[0]), int(one.step[-1])
         evidence = cause.evidence | {"p": cause.p, "explained": cause.explained, "against": "truth"}
+        evidence |= {"by_control": True} if one.by_control else {}
         known = parameter(case.run, f"{name}_bias")
         estimated = f"set {known[0]}=estimate; or " if known and known[1] != "estimate" and not cause.known else ""
         yield Finding(cause.code, severity, name, steps, evidence, cause.cause, estimated + cause.remedy)

@@ -27,24 +27,41 @@ _PLACES = 4000  # stages at most, from the first that counts on: of a thousand r
 
 class Tuned(NamedTuple):
     """The factor on a noise that explains the innovations best, its gain in log-likelihood against 1, and the
-    log-likelihoods of the factors that were tried."""
+    log-likelihoods of the log factors that were tried."""
 
     factor: float
     gain: float
     scores: Array
+    grid: Array = _GRID
 
     @property
     def known(self) -> bool:
         """Whether it is a number, and not the end of those that were tried."""
-        return abs(np.log(self.factor)) < 0.95 * _GRID[-1]
+        step = self.grid[1] - self.grid[0]
+        return bool(self.grid[0] + 0.3 * step < np.log(self.factor) < self.grid[-1] - 0.3 * step)
 
     def p_beyond(self, factor: float) -> float:
         """The chance of such innovations if the noise is too small by `factor` and not by more (Wilks 1938)."""
         if self.factor <= factor:
             return 1.0
-        fine, values = _spline(self.scores)
+        fine, values = _spline(self.scores, self.grid)
         held = float(values[np.searchsorted(fine, np.log(factor))])
         return float(0.5 * chi2.sf(2 * max(float(values.max()) - held, 0.0), 1))
+
+    def odds(self, factor: float) -> float:
+        """By how much the best factor is likelier than this one."""
+        fine, values = _spline(self.scores, self.grid)
+        if not fine[0] <= np.log(factor) <= fine[-1]:
+            return np.inf
+        return float(np.exp(min(values.max() - values[np.searchsorted(fine, np.log(factor))], 700.0)))
+
+
+class _Model(NamedTuple):
+    """The filter's predictions, F by name, its updates by name, and its sensors."""
+
+    moves: dict[str, Array]
+    updates: dict[str, StageTable]
+    sensors: list[str]
 
 
 def factors(case: Case) -> dict[str, Tuned]:
@@ -52,31 +69,75 @@ def factors(case: Case) -> dict[str, Tuned]:
     return once(case, "_tuned", _factors)
 
 
-def _factors(case: Case) -> dict[str, Tuned]:
+def _model(case: Case) -> _Model | None:
     run = case.run
     if run.labels or "cov" not in run.ends:
-        return {}
+        return None
     moves = {name: F for name, table in run.stages.items() if (F := transitions(case, table)) is not None}
     updates = {name: table for name, table in run.stages.items() if tells_gain(table)}
     if any(name.startswith("predict") and name not in moves for name in run.stages) or not updates:
-        return {}
+        return None
     names = list(dict.fromkeys(n.partition("/")[0] for t in updates.values() for n in _parts(t)))
     if not all(np.nan_to_num(t.values["innovation.noise"]).any() for t in updates.values()):
+        return None
+    return _Model(moves, updates, names)
+
+
+def _factors(case: Case) -> dict[str, Tuned]:
+    model = once(case, "_model", _model)
+    if model is None:
         return {}
-    kinds = [*names, "Q"] if moves else names
+    kinds = [*model.sensors, "Q"] if model.moves else model.sensors
     B = len(kinds) * len(_GRID)
     scale = {kind: np.ones(B) for kind in kinds}
     for i, kind in enumerate(kinds):
         scale[kind][i * len(_GRID) : (i + 1) * len(_GRID)] = np.exp(_GRID)
-    scores = _scores(case, moves, updates, scale, B)
+    scores = _scores(case, model.moves, model.updates, scale, B)
     if scores is None:
         return {}
     found = {}
     for i, kind in enumerate(kinds):
         of = scores[i * len(_GRID) : (i + 1) * len(_GRID)]
-        at, best = _peak(of)
-        found[kind] = Tuned(float(np.exp(at)), float(best - of[len(_GRID) // 2]), of)
+        found[kind] = _best(of, _GRID, of[len(_GRID) // 2])
+    if "Q" in found and not found["Q"].known:
+        found["Q"] = _further(case, model, found["Q"])
     return found
+
+
+def _best(scores: Array, grid: Array, own: float) -> Tuned:
+    at, best = _peak(scores, grid)
+    return Tuned(float(np.exp(at)), float(best - own), scores, grid)
+
+
+def _further(case: Case, model: _Model, found: Tuned) -> Tuned:
+    """Factors on Q beyond the grid's end, as those of a Q that lacks its dt: as many again on that side."""
+    grid = _GRID + (_GRID[-1] if found.factor > 1 else _GRID[0])
+    scale = {name: np.ones(len(grid)) for name in model.sensors} | {"Q": np.exp(grid)}
+    scores = _scores(case, model.moves, model.updates, scale, len(grid))
+    return found if scores is None else _best(scores, grid, float(found.scores[len(_GRID) // 2]))
+
+
+def exchanged(case: Case, one: str, other: str) -> float:
+    """The gain in log-likelihood where each of two sensors' R is the other's, component by component."""
+    model = once(case, "_model", _model)
+    if model is None or not model.moves:
+        return -np.inf
+    R = {name: _usual(model, name) for name in (one, other)}
+    scale = {name: np.ones(2) for name in (*model.sensors, "Q")}
+    scale[one][1], scale[other][1] = R[other] / R[one], R[one] / R[other]
+    scores = _scores(case, model.moves, model.updates, scale, 2)
+    return -np.inf if scores is None else float(scores[1] - scores[0])
+
+
+def _usual(model: _Model, name: str) -> float:
+    """The mean variance of a sensor's R, in the middle over its updates."""
+    found = [
+        np.median(np.diagonal(t.values["innovation.noise"], axis1=1, axis2=2)[:, axes].mean(1))
+        for t in model.updates.values()
+        for part, axes in _parts(t).items()
+        if part.partition("/")[0] == name
+    ]
+    return float(np.median(found))
 
 
 def _parts(table: StageTable) -> dict[str, slice]:
@@ -85,17 +146,17 @@ def _parts(table: StageTable) -> dict[str, slice]:
     return space.axes_at
 
 
-def _peak(scores: Array) -> tuple[float, float]:
+def _peak(scores: Array, grid: Array) -> tuple[float, float]:
     """Where a cubic spline through the scores of the grid has its top, and how high that is."""
-    fine, values = _spline(scores)
+    fine, values = _spline(scores, grid)
     k = int(np.argmax(values))
     return float(fine[k]), float(values[k])
 
 
-def _spline(scores: Array) -> tuple[Array, Array]:
+def _spline(scores: Array, grid: Array) -> tuple[Array, Array]:
     """Log factors, forty to each step of the grid, and a cubic spline through the grid's scores there."""
-    fine = np.linspace(_GRID[0], _GRID[-1], 40 * (len(_GRID) - 1) + 1)
-    return fine, np.asarray(CubicSpline(_GRID, np.nan_to_num(scores, nan=-1e300, neginf=-1e300))(fine))
+    fine = np.linspace(grid[0], grid[-1], 40 * (len(grid) - 1) + 1)
+    return fine, np.asarray(CubicSpline(grid, np.nan_to_num(scores, nan=-1e300, neginf=-1e300))(fine))
 
 
 def _scores(

@@ -24,7 +24,7 @@ from viz_estim.recording.tables import StageTable
 
 _FEWEST = 3
 _ALIKE = 1e-3  # of a matrix: that it is this other one, but for rounding
-_HALF = 0.5
+_ROUNDED = 1e-9  # of a covariance: half of the digits, for what is a difference of two
 
 
 class Told(NamedTuple):
@@ -50,7 +50,13 @@ def updates(case: Case) -> Iterator[Finding]:
         if tells_gain(table) and (told := _told(case, table)) is not None:
             points = any(key.endswith(".points") for key in table.values)
             reading = tells_reading(table.values["innovation.predicted"])
-            found = [_residual(told) if reading else None, _spread(told, points), _gain(told), _mean(told), _cov(told)]
+            lines = [
+                _spread(told, points),
+                _gain(told),
+                _mean(told),
+                _added(told, _noise(case, told.step)) or _cov(told),
+            ]
+            found = [_residual(told) if reading else None, *lines]
             for severity, what, cause, remedy in [one for one in found if one][:1]:
                 sensors = {name.partition("/")[0] for name in _space(table).parts}
                 name = sensors.pop() if len(sensors) == 1 else None
@@ -163,7 +169,7 @@ def _mean(told: Told) -> _Line | None:
             "error", "mean", "the mean stays as it was before the update: K·ν is not added to it, or to a copy only",
             "add K·ν to the mean, and carry that mean on",
         )  # fmt: skip
-    if abs(share - 1) > _HALF:
+    if not 1 / GROSS < share**2 < GROSS:  # of the variance that it takes in, as of any
         return (
             "warning", "mean", f"the mean moves {share:.2g}× as far as K·ν: another gain or residual moves it than "
             "those that are recorded", "move it by K·ν once, with the K and ν of this update",
@@ -199,6 +205,42 @@ def _cov(told: Told) -> _Line | None:
         "write P⁺ = (I − K·H)·P·(I − K·H)ᵀ + K·R·Kᵀ (Joseph), with the K, H and R of this update; the process noise Q "
         "belongs to the prediction alone",
     )  # fmt: skip
+
+
+def _noise(case: Case, step: np.ndarray) -> Array | None:
+    """Q (M, d, d) of the prediction of each of these steps, NaN where there is none; None where it is not recorded."""
+    d = len(case.space.axes)
+    tables = [t for t in case.run.stages.values() if {"transition", "noise"} <= t.values.keys()]
+    if len(tables) != 1 or tables[0].values["noise"].shape[1:] != (d, d) or not len(tables[0].step):
+        return None
+    at = np.minimum(np.searchsorted(tables[0].step, step), len(tables[0].step) - 1)
+    same = tables[0].step[at] == step
+    return np.where(same[:, None, None], tables[0].values["noise"][at], np.nan)
+
+
+def _added(told: Told, Q: Array | None) -> _Line | None:
+    """What is beyond P⁺ is the prediction's Q, to rounding; or the prediction has none, and something is added here."""
+    left = _left(told)
+    if Q is None or not sound(left).all():
+        return None
+    rows = np.isfinite(Q).all((1, 2))
+    beyond, size = told.after - left, np.abs(told.after).max((1, 2))
+    if rows.sum() < _FEWEST or np.median(np.abs(beyond[rows]).max((1, 2)) / size[rows]) < _ROUNDED:
+        return None
+    low, high = _ratios(told.after, left)
+    severity = _severity(high, told) or "warning"
+    if Q[rows].any() and _alike(beyond[rows], Q[rows]):
+        return (
+            severity, "covariance", "the covariance after an update is what its gain and S leave, and Q besides: the "
+            "process noise is added in the update as well as in the prediction", "add Q in the prediction alone",
+        )  # fmt: skip
+    if not Q[rows].any() and float(np.median(low)) > 1 - _ROUNDED:
+        return (
+            severity, "covariance", "the prediction adds no process noise, and the covariance after an update is "
+            f"larger than its gain and S leave, up to {float(np.median(high)):.3g}×: Q is added in the update, so that "
+            "it counts once a reading and not by time", "add Q in the prediction, and not in the update",
+        )  # fmt: skip
+    return None
 
 
 def _left(told: Told) -> Array:

@@ -251,6 +251,6 @@ def stopped_early(data: ScanData) -> Scenario:
 
 
 # The others enter themselves.
-from viz_estim.scenarios import flawed_readings, flawed_updates  # noqa: E402, F401
+from viz_estim.scenarios import flawed_habits, flawed_readings, flawed_updates  # noqa: E402, F401
 
 __all__ = ["FLAWED"]

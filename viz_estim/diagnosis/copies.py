@@ -1,0 +1,78 @@
+"""Particles that are copies of one another: do they part, and do their weights count once?
+
+Both are exact: a copy that draws a noise of its own is the same again with the chance 0, and copies that are drawn by
+their weights stand for these by their number (Gordon, Salmond and Smith 1993).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from viz_estim.core.quaternions import Array
+from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.finding import Finding
+from viz_estim.recording.tables import StageTable
+
+_FEWEST = 3  # steps at which it is seen
+
+
+def together(case: Case) -> Iterator[Finding]:
+    """Copies that the prediction leaves copies: it adds no noise to them, or one draw to all."""
+    for table in case.run.stages.values():
+        if not table.name.startswith("predict") or "states" not in table.values:
+            continue
+        steps: list[int] = []
+        parted = False
+        for row, cloud in enumerate(table.values["states"]):
+            before = _past(case, table, row, "states")
+            if before is None or before.shape != cloud.shape or (cloud == before).all():
+                continue
+            order = np.lexsort(before.T)
+            same = (before[order[1:]] == before[order[:-1]]).all(1)
+            still = (cloud[order[1:]] == cloud[order[:-1]]).all(1)
+            if same.any():
+                parted = parted or not still[same].all()
+                steps.append(int(table.step[row]))
+        if len(steps) >= _FEWEST and not parted:
+            yield Finding(
+                "particles_collapsed", "error", None, (steps[0], steps[-1]), {"steps": len(steps), "kind": "together"},
+                "copies of a particle stay copies in the prediction: no noise is added to them, or one draw to all, so "
+                "that each resampling leaves fewer different ones",
+                "draw a noise for each particle: `rng.normal(size=(N, …))`, not once a step",
+            )  # fmt: skip
+
+
+def weighed_again(case: Case) -> Iterator[Finding]:
+    """Weights that the copies keep after they were drawn by them."""
+    for table in case.run.stages.values():
+        if "ancestors" not in table.values or "log_weights" not in table.values:
+            continue
+        steps: list[int] = []
+        ancestors = table.values["ancestors"]
+        for row, after in enumerate(table.values["log_weights"]):
+            before = _past(case, table, row, "log_weights")
+            if before is None or before.shape != after.shape or not np.ptp(after) > 0:
+                continue
+            of = np.asarray(ancestors[row]).astype(int)
+            if of.shape != after.shape or of.max() >= len(before):
+                continue  # a cloud that was thinned
+            kept, drawn = before[of], (of != np.arange(len(of))).any()
+            shift = kept - after
+            if drawn and np.ptp(shift[np.isfinite(shift)]) < 1e-9 * max(1.0, float(np.abs(kept).max())):
+                steps.append(int(table.step[row]))
+        if len(steps) >= _FEWEST:
+            yield Finding(
+                "used_twice", "error", None, (steps[0], steps[-1]), {"times": len(steps)},
+                f"at {len(steps)} steps particles that were copied by their weights keep these weights: what was read "
+                "counts twice, by how many copies there are and by what each weighs",
+                "set all weights to 1/N after a resampling",
+            )  # fmt: skip
+
+
+def _past(case: Case, table: StageTable, row: int, what: str) -> Array | None:
+    """What the stage before had, of the same run of stages; None where it was not kept."""
+    place = int(table.place[row])
+    past = case.sequence.stage[place - 1] if place else None
+    return None if past is None or what not in past[0].values else past[0].values[what][past[1]]
