@@ -165,7 +165,7 @@ def _import(path: Path) -> Any:
     sys.modules[spec.name] = module  # dataclasses look their module up
     sys.path.insert(0, str(path.parent.resolve()))
     try:
-        # From the source itself: byte code is told from an older version's by the second, and would lie about beside it.
+        # From the source itself: byte code is told from an older one's by the second, and would be left there.
         exec(compile(path.read_bytes(), path, "exec"), vars(module))
     except (Exception, SystemExit) as error:
         raise BadInput(f"{path}: cannot be imported ({type(error).__name__}: {error})") from error
