@@ -278,7 +278,7 @@ class NoFile:
     def close(self) -> None: ...
 
 
-@pytest.mark.parametrize("seed", range(200))
+@pytest.mark.parametrize("seed", range(100))
 def test_no_script_ends_it_and_every_back_is_exact(
     seed: int, cli: Cli, walk: str, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -703,7 +703,7 @@ def test_a_session_in_a_real_terminal(recording: Path) -> None:
 
 @pytest.fixture
 def viewer() -> Iterator[Viewer]:
-    with Viewer.start(headless=True, size=(600, 400)) as started:
+    with Viewer.start(headless=True, size=(300, 200)) as started:
         yield started
 
 

@@ -276,19 +276,18 @@ def test_a_place_and_a_heading_are_known_by_name_and_unit(names: Any, parts: dic
 
 
 @pytest.mark.draws
-@pytest.mark.parametrize("knows", [True, False])
-def test_the_view_frames_a_run_of_which_only_the_start_was_known(knows: bool, cli: Cli, tmp_path: Path) -> None:
+def test_the_view_frames_a_run_of_which_only_the_start_was_known(cli: Cli, tmp_path: Path) -> None:
     """Far from where it began: the way so far is in the picture, and no speck of it."""
     with viz_estim.record(tmp_path / "a.rrd", {"x": "m", "y": "m", "theta": "rad"}) as rec:
         for k in range(60):
             x = np.array([40 * np.cos(k / 9), 40 * np.sin(k / 9), k / 9])
             rec.stage("predict", mean=x, cov=np.eye(3))
-            rec.step(time=k, truth=1.1 * x if knows else None)
-    done = cli("snapshot", tmp_path / "a.rrd", "--step", 59, "--size", "800x600", "-o", tmp_path / "a.png")
+            rec.step(time=k, truth=1.1 * x if k > 9 else [np.nan] * 3)
+    done = cli("snapshot", tmp_path / "a.rrd", "--step", 59, "--size", "600x500", "-o", tmp_path / "a.png")
     assert (done.code, done.err) == (0, "")
-    pixels = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)[60:400, 10:300]
+    pixels = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)[70:300, 10:230]
     rows, columns = np.nonzero((pixels[..., 0] > 150) & (pixels[..., 2] < 80))  # amber
-    assert min(np.ptp(rows), np.ptp(columns)) > 100
+    assert min(np.ptp(rows), np.ptp(columns)) > 70
 
 
 @pytest.mark.draws

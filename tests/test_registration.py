@@ -69,7 +69,7 @@ def naive(X: Array, Y: Array, max_distance: float) -> Iterator[tuple[list[tuple[
 @both
 @pytest.mark.parametrize("max_distance", [0.12, 5.0])
 def test_each_iteration_is_that_of_the_naive_loop(d: int, max_distance: float) -> None:
-    X, Y = pair(d, 1)
+    X, Y = pair(d, 1, 80)
     steps = list(run(scenario(X, Y, max_distance, 6)))
     assert (steps[1].stages[-1].count < len(X)) == (max_distance < 1)
     assert [[stage.name for stage in step.stages] for step in steps] == [["start"], *[["match", "align"]] * 6]

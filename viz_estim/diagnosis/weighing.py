@@ -15,7 +15,7 @@ from viz_estim.diagnosis.naming import likeliest
 
 
 def noises(case: Case) -> Iterator[Finding]:
-    """The sum of r²/R over a sensor's readings, which is χ² if its noise is what the likelihood takes it for.
+    """The sum of (r − r̄)²/R over a sensor's readings, which is χ² if its noise is what the likelihood takes it for.
 
     Of particles alone, for other filters' innovations tell it without a truth. Told where R is too small: a larger one
     is what particles need where they are few. Large is GROSS, as of any variance (`confidence.size`).
@@ -28,7 +28,8 @@ def noises(case: Case) -> Iterator[Finding]:
     dof: dict[str, int] = {}
     for one in against(case):
         name = one.name.partition("/")[0]
-        by_name.setdefault(name, []).append(squared_distance(one.r, one.noise))
+        apart = one.r - one.r.mean(0)  # a bias is no noise, and is told for itself
+        by_name.setdefault(name, []).append(squared_distance(apart, one.noise))
         variance.setdefault(name, []).append(float(np.trace(one.noise[0]) / len(one.noise[0])))
         steps[name], dof[name] = (int(one.step[0]), int(one.step[-1])), one.r.shape[1]
     for name, found in by_name.items():

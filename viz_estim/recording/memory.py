@@ -16,7 +16,7 @@ from viz_estim.core.spaces import Space
 from viz_estim.core.stages import Innovation, Matches, SigmaPoints, Stage
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.reader import Run
-from viz_estim.recording.tables import StageTable, ends
+from viz_estim.recording.tables import StageTable, ends, work_out
 
 
 def collect(scenario: Scenario, steps: Iterable[Step], params: dict[str, Any] | None = None) -> Run:
@@ -32,7 +32,8 @@ def collect(scenario: Scenario, steps: Iterable[Step], params: dict[str, Any] | 
             stages.setdefault(stage.name, []).append((step.index, place, stage))
             place += 1
         place += not step.stages
-    tables = {name: _table(name, found) for name, found in stages.items()}
+    tables = {name: _table(name, found, space) for name, found in stages.items()}
+    work_out(tables, space)
     index = np.array([step.index for step in rows])
     size = 1 if labels else len(space.names)
     properties = {
@@ -73,13 +74,15 @@ def _stacked(values: list[Any]) -> Array:
     return np.array([absent if v is None else v for v in values], float)
 
 
-def _table(name: str, found: list[tuple[int, int, Stage]]) -> StageTable:
+def _table(name: str, found: list[tuple[int, int, Stage]], space: Space) -> StageTable:
     index, places, stages = zip(*found, strict=True)
     values: dict[str, Any] = {}
     spaces: dict[str, Space] = {}
-    for kind in ("mean", "cov", "states", "log_weights", "log_probabilities"):
-        if hasattr(stages[0].belief, kind):
-            values[kind] = np.stack([getattr(stage.belief, kind) for stage in stages])
+    for kind in stages[0].belief.shapes:
+        values[kind] = np.stack([getattr(stage.belief, kind) for stage in stages])
+    if "states" in values:  # the moments of many clouds are worked out at once
+        n, d = len(space.names), len(space.axes)
+        values |= {"mean": np.full((len(found), n), np.nan), "cov": np.full((len(found), d, d), np.nan)}
     for field in [f.name for f in dataclasses.fields(stages[0])[2:]]:
         of = [getattr(stage, field) for stage in stages]
         if isinstance(of[0], SigmaPoints):

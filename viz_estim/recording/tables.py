@@ -183,7 +183,7 @@ def work_out(tables: dict[str, StageTable], space: Space) -> None:
         if "states" in table.values:
             states, weights = table.values["states"], table.values["log_weights"]
             lacking = np.flatnonzero(np.isnan(table.mean).all(1) & np.isfinite(weights).all(1))
-            for some in np.array_split(lacking, max(1, len(lacking) * weights.shape[1] // 50_000)):
+            for some in np.array_split(lacking, max(1, len(lacking) * weights.shape[1] // 10_000)):
                 if len(some):
                     table.mean[some], table.cov[some] = moments(space, states[some], weights[some])
 
