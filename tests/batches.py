@@ -36,6 +36,8 @@ def together(scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Run]:
     """
     try:
         found = _batch(scenarios)
+    except (TypeError, NameError):  # a slip of ours, which would only be seen by how long it takes
+        raise
     except Exception:  # whatever it is, alone it happens to one of them
         return [collect(scenario, run(scenario, seed)) for scenario, seed in zip(scenarios, seeds, strict=True)]
     alone = collect(scenarios[-1], islice(run(scenarios[-1], seeds[-1]), 20))
@@ -67,7 +69,7 @@ def _batch(scenarios: Sequence[Scenario]) -> list[Run]:
             found.setdefault(stage.name, []).append((k, place, stage))
             place += 1
         place += not stages
-    whole = {name: _table(name, rows) for name, rows in found.items()}
+    whole = {name: _table(name, rows, first.space) for name, rows in found.items()}
     return [_member(scenario, whole, i) for i, scenario in enumerate(scenarios)]
 
 

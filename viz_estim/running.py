@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.machinery
 import importlib.util
 import inspect
 import platform
@@ -156,17 +157,25 @@ def _flawed(name: str) -> Source:
     return Source(name, flaw.scenario, flaw.data, next(key for key, value in SYSTEMS.items() if value is flaw.system))
 
 
+class _FromSource(importlib.machinery.SourceFileLoader):
+    """Neither takes nor leaves byte code: which source it is of is told by the second, and a person edits and runs."""
+
+    def path_stats(self, path: str) -> Any:
+        raise OSError
+
+
 def _import(path: Path) -> Any:
     if not path.is_file():
         raise BadInput(f"{path}: no such file")
-    spec = importlib.util.spec_from_file_location(f"viz_estim_user_{path.stem}", path)
+    name = f"viz_estim_user_{path.stem}"
+    loader = _FromSource(name, str(path))
+    spec = importlib.util.spec_from_file_location(name, path, loader=loader)
     assert spec
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     sys.path.insert(0, str(path.parent.resolve()))
     try:
-        # From the source itself: byte code is told from an older one's by the second, and would be left there.
-        exec(compile(path.read_bytes(), path, "exec"), vars(module))
+        loader.exec_module(module)
     except (Exception, SystemExit) as error:
         raise BadInput(f"{path}: cannot be imported ({type(error).__name__}: {error})") from error
     finally:

@@ -15,7 +15,7 @@ from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import Finding, level
 from viz_estim.recording.tables import StageTable
 
-_LOOKED_AT = 200  # steps at most, at which modes are looked for
+_LOOKED_AT = 100  # steps at most, at which modes are looked for
 
 # Fewer effective particles than this, and the cloud's variance is too small by more than a factor of 2 in more than one
 # of twenty cases: with n independent ones it is χ²(n − 1)/(n − 1) of the true one.
