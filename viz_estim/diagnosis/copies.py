@@ -12,7 +12,7 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import Finding
+from viz_estim.diagnosis.finding import Finding, at_steps
 from viz_estim.recording.tables import StageTable
 
 _FEWEST = 3  # steps at which it is seen
@@ -65,7 +65,7 @@ def weighed_again(case: Case) -> Iterator[Finding]:
         if len(steps) >= _FEWEST:
             yield Finding(
                 "used_twice", "error", None, (steps[0], steps[-1]), {"times": len(steps)},
-                f"at {len(steps)} steps particles that were copied by their weights keep these weights: what was read "
+                f"{at_steps(len(steps))} particles that were copied by their weights keep these weights: what was read "
                 "counts twice, by how many copies there are and by what each weighs",
                 "set all weights to 1/N after a resampling",
             )  # fmt: skip

@@ -12,7 +12,7 @@ from viz_estim.core.modes import moments, several
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import Finding, level
+from viz_estim.diagnosis.finding import Finding, at_steps, level
 from viz_estim.recording.tables import StageTable
 
 _LOOKED_AT = 100  # steps at most, at which modes are looked for
@@ -51,8 +51,8 @@ def collapsed(case: Case) -> Iterator[Finding]:
     yield Finding(
         "particles_collapsed", "error" if lasting and len(steps) > 2 else "warning", None, (steps[0], steps[-1]),
         evidence,
-        f"at {len(steps)} steps hardly any of the {N} particles are left (as few as {least:.0f}): the readings are far "
-        "narrower than the cloud, or the cloud has no particle where they are",
+        f"{at_steps(len(steps))} hardly any of the {N} particles are left (as few as {least:.0f}): the readings are "
+        "far narrower than the cloud, or the cloud has no particle where they are",
         "take more particles, or widen the noises (of readings, so that neighbours count; of the motion, so that "
         "copies part)",
     )  # fmt: skip
@@ -94,7 +94,7 @@ def clamped(case: Case) -> Iterator[Finding]:
         yield Finding(
             "particles_clamped", "error" if most > scatter else "warning", None, (min(found), max(found)),
             {"steps": len(set(found)), "largest_share": most},
-            f"at {len(set(found))} steps many particles share the very same number at the edge of the cloud: they are "
+            f"{at_steps(len(set(found)))} many particles share the very same number at the edge of the cloud: they are "
             "held at a bound, where they pile up and pull the mean",
             "let particles leave the area, and let their likelihood deal with them; or draw those anew that leave",
         )  # fmt: skip
@@ -147,7 +147,7 @@ def several_modes(case: Case) -> Iterator[Finding]:
         yield Finding(
             "several_modes", "warning" if lasting else "note", None, (min(apart), max(apart)),
             {"steps": len(apart) * every, "share": share, "hollow": len(empty) * every},
-            f"at {len(apart) * every} steps the particles form several clouds"
+            f"{at_steps(len(apart) * every)} the particles form several clouds"
             + (f", at {len(empty) * every} of them the mean lies between them, where nobody is" if empty else ""),
             "report the heaviest mode instead of the mean until the readings have decided",
         )  # fmt: skip
@@ -191,7 +191,7 @@ def far(case: Case) -> Iterator[Finding]:
             yield Finding(
                 "particles_far", "error" if bad.mean() > 0.05 else "warning", None, (int(of[0]), int(of[-1])),
                 {"steps": int(bad.sum()), "least_p": float(p.min())},
-                f"at {int(bad.sum())} steps no particle is where the readings are: even the best one explains "
+                f"{at_steps(int(bad.sum()))} no particle is where the readings are: even the best one explains "
                 "them worse than their noise allows",
                 "take more particles or a wider motion noise; then check the units and the order of the readings",
             )  # fmt: skip
