@@ -35,10 +35,12 @@ def moments(space: Space, states: Array, log_weights: Array) -> tuple[Array, Arr
     """
     # Each component in one piece: numpy is fast along long axes.
     states = np.moveaxis(np.ascontiguousarray(np.moveaxis(states, -1, 0)), 0, -1)
-    alike = not log_weights.strides[-1]  # one number for all: to look for the heaviest takes as long as all else
-    weights = _weights(log_weights)[..., None]
-    heaviest = states[..., :1, :] if alike else np.take_along_axis(states, log_weights.argmax(-1)[..., None, None], -2)
-    mean = heaviest
+    if log_weights.strides[-1]:
+        weights = np.exp(log_weights)[..., None]
+        mean = np.take_along_axis(states, log_weights.argmax(-1)[..., None, None], axis=-2)
+    else:  # one number spread over all particles: its exponential is taken once, and the first is as heavy as any
+        weights = np.ascontiguousarray(np.broadcast_to(np.exp(log_weights[..., :1]), log_weights.shape))[..., None]
+        mean = states[..., :1, :]
     for rounds in range(_ROUNDS):
         error = space.minus(states, mean)
         across = np.swapaxes(error, -1, -2)
@@ -50,13 +52,6 @@ def moments(space: Space, states: Array, log_weights: Array) -> tuple[Array, Arr
     # One product a pair of components: BLAS takes thrice as long for matrices that are so long and thin.
     cov = np.vecdot((across * np.swapaxes(weights, -1, -2))[..., :, None, :], across[..., None, :, :])
     return mean[..., 0, :], 0.5 * (cov + np.swapaxes(cov, -1, -2))
-
-
-def _weights(log_weights: Array) -> Array:
-    """Their exponentials; of one number spread over all particles, that one's."""
-    if log_weights.strides[-1] or log_weights.shape[-1] < 2:
-        return np.exp(log_weights)
-    return np.ascontiguousarray(np.broadcast_to(np.exp(log_weights[..., :1]), log_weights.shape))
 
 
 def modes(space: Space, states: Array, log_weights: Array, least: float = 0.05) -> tuple[Mode, ...]:

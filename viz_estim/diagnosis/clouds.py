@@ -39,12 +39,11 @@ def moves(case: Case) -> Moves | None:
         return None
     (table,), pose = found, SE2()
     kept: list[tuple[int, Array, Array]] = []
-    for row, (step, place) in enumerate(zip(table.step.tolist(), table.place.tolist(), strict=True)):
-        past, at = case.sequence.stage[place - 1] if place else None, int(np.searchsorted(run.step, step))
-        before = past[0].values.get("states") if past else None
-        if past is None or before is None or at == 0 or step <= case.first:
+    for row, step in enumerate(table.step.tolist()):
+        x, at = case.sequence.past(table, row, "states"), int(np.searchsorted(run.step, step))
+        if x is None or at == 0 or step <= case.first:
             continue
-        x, y, weights = before[past[1]], table.values["states"][row], np.exp(table.values["log_weights"][row])
+        y, weights = table.values["states"][row], np.exp(table.values["log_weights"][row])
         told = weights @ pose.minus(y, x)
         truly = pose.minus(run.truth[at], run.truth[at - 1])
         if np.isfinite(told).all() and np.isfinite(truly).all():

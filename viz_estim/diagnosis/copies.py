@@ -10,10 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import Finding, at_steps
-from viz_estim.recording.tables import StageTable
 
 _FEWEST = 3  # steps at which it is seen
 
@@ -26,7 +24,7 @@ def together(case: Case) -> Iterator[Finding]:
         steps: list[int] = []
         parted = False
         for row, cloud in enumerate(table.values["states"]):
-            before = _past(case, table, row, "states")
+            before = case.sequence.past(table, row, "states")
             if before is None or before.shape != cloud.shape or (cloud == before).all():
                 continue
             order = np.lexsort(before.T)
@@ -52,7 +50,7 @@ def weighed_again(case: Case) -> Iterator[Finding]:
         steps: list[int] = []
         ancestors = table.values["ancestors"]
         for row, after in enumerate(table.values["log_weights"]):
-            before = _past(case, table, row, "log_weights")
+            before = case.sequence.past(table, row, "log_weights")
             if before is None or before.shape != after.shape or not np.ptp(after) > 0:
                 continue
             of = np.asarray(ancestors[row]).astype(int)
@@ -69,10 +67,3 @@ def weighed_again(case: Case) -> Iterator[Finding]:
                 "counts twice, by how many copies there are and by what each weighs",
                 "set all weights to 1/N after a resampling",
             )  # fmt: skip
-
-
-def _past(case: Case, table: StageTable, row: int, what: str) -> Array | None:
-    """What the stage before had, of the same run of stages; None where it was not kept."""
-    place = int(table.place[row])
-    past = case.sequence.stage[place - 1] if place else None
-    return None if past is None or what not in past[0].values else past[0].values[what][past[1]]

@@ -140,6 +140,12 @@ class Sequence:
         mean[at < 0], cov[at < 0] = np.nan, np.nan
         return mean, cov
 
+    def past(self, table: StageTable, row: int, what: str) -> Array | None:
+        """A quantity of the stage before one of a stage's rows, such as `states` (N, n); None where it was not kept."""
+        place = int(table.place[row])
+        found = self.stage[place - 1] if place else None
+        return None if found is None or what not in found[0].values else found[0].values[what][found[1]]
+
 
 @dataclass(frozen=True)
 class Case:

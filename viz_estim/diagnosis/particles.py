@@ -102,12 +102,10 @@ def clamped(case: Case) -> Iterator[Finding]:
 
 def _before(case: Case, table: StageTable, row: int) -> Array | None:
     """The states (N, n) before a stage; None where they were not kept."""
-    place = int(table.place[row])
-    past = case.sequence.stage[place - 1] if place else None
-    if past is None or "states" not in past[0].values:
+    states = case.sequence.past(table, row, "states")
+    if states is None or states.shape != table.values["states"][row].shape or not np.isfinite(states).all():
         return None
-    states: Array = past[0].values["states"][past[1]]
-    return states if np.isfinite(states).all() and states.shape == table.values["states"][row].shape else None
+    return states
 
 
 def _different(values: Array) -> int:
