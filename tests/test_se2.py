@@ -1,5 +1,6 @@
 """The drive on SE(2): a reference of many particles, the exponential map, times, a real log, files, bad input."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -146,6 +147,8 @@ def test_logs_are_read_with_and_without_a_truth(tmp_path: Path) -> None:
     bare = se2.se2_pf(se2.se2([tmp_path / "bare.CSV"], RNG))
     assert bare.truth is None
     np.testing.assert_allclose(bare.beliefs[0].mean, 0, atol=1e-12)
+    (tmp_path / "named.txt").write_text(log_text().replace("t ", "time ", 1))
+    np.testing.assert_array_equal(se2.se2([tmp_path / "named.txt"], RNG).time, data.time)
     late = Drive(data.time, data.rates, data.positions, data.truth.copy(), 0.4)
     late.truth[:5] = np.nan
     assert list(se2.se2_pf(late).beliefs) == [0, 5]
@@ -161,14 +164,22 @@ def test_the_problem_comes_back_as_it_was_saved(tmp_path: Path) -> None:
     assert again.wheel_noise == PROBLEM.wheel_noise
 
 
+@pytest.mark.parametrize("reading", [",", "1,2"])
+def test_a_drive_of_one_row_is_a_run_of_one_step(reading: str, cli: Cli, tmp_path: Path) -> None:
+    (tmp_path / "one.csv").write_text(f"time,left,right,x,y\n3,1.5,2,{reading}\n")
+    done = cli("run", "se2-pf", "--data", tmp_path / "one.csv", "--out", tmp_path / "a.rrd", "--json")
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["steps"] == 1
+
+
 HEADER = "time,left,right,x,y\n0,1,2,,\n"
 BAD: dict[str, tuple[str, str]] = {
     "empty": ("", "is empty"),
     "names alone": ("time,left,right\n", "names alone"),
     "no right": ("time,left\n0,1\n5,1\n", "missing right (columns: time, left)"),
     "no gyro": ("t vx theta\n0 1 2\n1 1 2\n", "missing gyro"),
-    "other columns": ("a,b\n1,2\n3,4\n", "missing t, vx, gyro"),
-    "no header": ("0 1 2\n1 1 2\n2 3 4\n", "missing t, vx, gyro"),
+    "other columns": ("a,b\n1,2\n3,4\n", "missing time, vx, gyro"),
+    "no header": ("0 1 2\n1 1 2\n2 3 4\n", "missing time, vx, gyro"),
     "a cell too few": (HEADER + "5,1,2,3\n", "line 3 has 4 cells"),
     "truncated": (log_text()[:-9], "line 41 has"),
     "text": (HEADER + "5,fast,2,,\n", "line 3, left: 'fast' is not a number"),

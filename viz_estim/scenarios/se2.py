@@ -101,7 +101,8 @@ def moved(poses: Array, rates: Array, dt: float) -> Array:
 
 def _way(drive: Drive) -> things.Path:
     """Where the drive would go without noise: its arcs, one an interval."""
-    pose, pieces = np.zeros(3), []
+    pose = np.zeros(3)
+    pieces = [pose[None]]
     for k in range(1, len(drive.time)):
         share = np.linspace(0, 1, 21)[:, None] * (drive.time[k] - drive.time[k - 1])
         arc = moved(pose, share * drive.rates[k], 1.0)

@@ -4,8 +4,8 @@ Tables as `tables` reads them, columns in any order; others are left.
 
 - A problem: `time` s, `left` and `right` (wheel rates in rad/s that act up to that time), and where there is a reading
   of the position `x` and `y` m.
-- A log (the Wifibot's): `t` s, `vx` m/s by the wheels' odometry and `gyro` rad/s, each of the time up to that stamp,
-  and where it is known the true pose `px`, `py` m, `theta` rad.
+- A log (the Wifibot's): `t` or `time` s, `vx` m/s by the wheels' odometry and `gyro` rad/s, each of the time up to that
+  stamp, and where it is known the true pose `px`, `py` m, `theta` rad.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from viz_estim.scenarios.tables import Table, read_table
 
 RADIUS, TRACK = 0.25, 0.5  # m: of a wheel, and between the wheels
 _SUFFIXES = (".csv", ".txt")
-_PROBLEM, _LOG = ("time", "left", "right"), ("t", "vx", "gyro")
+_PROBLEM, _LOG = ("time", "left", "right"), ("time", "vx", "gyro")
 _POSITION, _TRUTH = ("x", "y"), ("px", "py", "theta")
 _WHAT = f"a .csv or .txt with the columns {', '.join(_PROBLEM)}, or {', '.join(_LOG)}"
 
@@ -79,7 +79,7 @@ def find(paths: list[Path]) -> Path:
 
 def load(path: Path) -> Drive:
     """The file read and checked; NaN is allowed where a reading of the position or the truth is absent, alone."""
-    table = read_table(path)
+    table = _table(path)
     needed = _PROBLEM if "left" in table or "right" in table else _LOG
     missing = [name for name in needed if name not in table]
     if missing:
@@ -122,9 +122,13 @@ def save(path: Path, drive: Drive) -> list[Path]:
     return [path]
 
 
+def _table(path: Path) -> Table:
+    return read_table(path, {"t": "time"})
+
+
 def _fits(path: Path) -> bool:
     try:
-        names = read_table(path).names
+        names = _table(path).names
     except BadInput:
         return False
     return set(_PROBLEM) <= set(names) or set(_LOG) <= set(names)
