@@ -25,6 +25,7 @@ _SUFFIXES = (".txt", ".csv", ".xyz", ".ply")  # of what a folder is searched for
 _SAVED = ("cloudX.csv", "cloudY.csv", "cloudList.csv")
 _AXES = ("x", "y", "z")
 _METRES = re.compile(r"\s*[\[(]\s*m\s*[\])]")  # beside a name in a header
+_WIDE = 20  # columns of two or three lines: no points with so many properties, but one coordinate a line
 _NOT_RIGID = 1e-3  # of a rotation matrix from the one nearest to it, whose file may hold few digits
 
 
@@ -138,6 +139,8 @@ def _columns(path: Path, names: list[str], lines: list[tuple[int, str]]) -> list
             raise BadInput(f"{path}: neither a cloud (x, y[, z]) nor poses (reading, gT00 …): {', '.join(names)[:200]}")
         return [names.index(axis) for axis in _AXES if axis in names]
     cells = _cells(lines[0][1])
+    if len(lines) <= len(_AXES) and len(cells) > _WIDE:
+        raise BadInput(f"{path}: {len(lines)} lines of {len(cells)} numbers, expected one point a line; transpose it")
     if len(cells) < 2:
         raise BadInput(f"{path}: neither a cloud (x, y[, z]) nor poses: its first line is {lines[0][1][:60]!r}")
     return list(range(min(3, len(cells))))
@@ -147,7 +150,9 @@ def _read_text(path: Path) -> tuple[list[str], list[tuple[int, str]]]:
     """The header's names in lower case, none where there is no header, and the other lines with their numbers."""
     try:
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise BadInput(f"{path}: cannot be read, it is neither text in UTF-8 nor PLY; save it as CSV or PLY") from error
+    except OSError as error:
         raise unreadable(path, error) from error
     lines = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -166,6 +171,8 @@ def _read_text(path: Path) -> tuple[list[str], list[tuple[int, str]]]:
 
 def _cells(line: str) -> list[str]:
     separator = next((mark for mark in ";," if mark in line), None)
+    if separator == ";":  # a comma beside semicolons is a decimal one
+        line = line.replace(",", ".")
     return [cell.strip() for cell in line.split(separator)]
 
 
