@@ -32,6 +32,7 @@ TEXTS = {
     "no end of line": PLAIN.rstrip(),
     "comments": "# of my robot\n" + PLAIN.replace("\n5", "\n% later\n5"),
     "a header in a comment": "# of my robot\n# " + PLAIN,
+    "a header of commas in a comment, over blanks": "# time, left, right\n0 1.5 2\n5 1.25 -2e-3\n",
     "quotes": '"time","left","right"\n"0","1.5","2"\n"5","1.25","-2e-3"\n',
     "another case": PLAIN.replace("left", "LEFT").replace("time", "Time"),
     "units": PLAIN.replace("time", "time [s]").replace("left", "left (rad/s)"),

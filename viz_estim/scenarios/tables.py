@@ -155,7 +155,8 @@ def _read_text(path: Path) -> Table:
     if not lines:
         raise BadInput(f"{path}: is empty, or holds column names alone")
     separator = next(s for s in _SEPARATORS if s is None or (s in header and s in lines[0][1]))
-    heads = _split(header, separator)
+    # Over rows of blanks, names in a comment are often separated otherwise.
+    heads = _split(header if separator else re.sub("[;,]", " ", header), separator)
     while heads and not heads[-1]:
         heads.pop()
     rows = []
