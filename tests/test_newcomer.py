@@ -1,6 +1,8 @@
 """What a newcomer stumbles over: files that are none, runs cut short at once, numbers that are none."""
 
+import os
 import runpy
+import subprocess
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -67,8 +69,46 @@ def test_what_is_no_number_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="stage update: mean: expected numbers, got 'fast'"):
         rec.stage("update", mean="fast", cov=[[1]])  # type: ignore[arg-type]
     rec.stage("update", mean=[1], cov=[[1]])
+    with pytest.raises(ValueError, match="step 0: expected a time in seconds, got ndarray"):
+        rec.step(time=np.arange(2.0))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="step 0: expected a time in seconds, got datetime"):
         rec.step(time=datetime(2026, 1, 1))  # type: ignore[arg-type]
+
+
+def test_a_time_may_be_an_array_of_one(tmp_path: Path) -> None:
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        for time in (np.array(0.5), np.array([0.75])):
+            rec.stage("update", mean=np.array(1), cov=np.array(2))
+            rec.step(time=time)  # type: ignore[arg-type]
+    assert viz_estim.load(tmp_path / "a.rrd").time.tolist() == [0.5, 0.75]
+
+
+def test_a_trajectory_without_a_number_is_refused(tmp_path: Path, cli: Cli) -> None:
+    with viz_estim.record(tmp_path / "a.rrd", {"x": "m", "y": "m"}) as rec:
+        rec.stage("update", mean=[np.nan] * 2, cov=np.eye(2))
+        rec.step(time=0)
+    done = cli("export", tmp_path / "a.rrd", "--to", "tum", "-o", tmp_path / "a.tum")
+    assert (done.code, done.out) == (2, "")
+    assert "no trajectory" in done.err
+
+
+@pytest.mark.parametrize("command", [["show", "--step", "1"], ["diagnose"], ["compare"]])
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252"])
+def test_a_terminal_of_another_alphabet_shows_what_it_can(command: list[str], encoding: str, tmp_path: Path) -> None:
+    with viz_estim.record(tmp_path / "a.rrd", {"x": "m"}) as rec:
+        for k in range(40):
+            rec.stage("update", mean=[0], cov=[[1]], residual=[9.0], residual_cov=[[1]], gain=[[0.1]])
+            rec.step(time=k)
+    files = [tmp_path / "a.rrd"] * (2 if command == ["compare"] else 1)
+    more = ["--out", tmp_path / "b.rrd"] if command == ["compare"] else []
+    done = subprocess.run(
+        [sys.executable, "-m", "viz_estim", command[0], *files, *command[1:], *more],
+        env=os.environ | {"PYTHONIOENCODING": encoding},
+        capture_output=True,
+    )  # fmt: skip
+    assert done.returncode in (0, 1), done.stderr
+    assert b"Traceback" not in done.stderr
+    assert "?" in done.stdout.decode(encoding) or command == ["compare"]
 
 
 def test_the_package_is_a_program(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

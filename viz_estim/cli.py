@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import sys
 from collections.abc import Callable
@@ -21,8 +22,9 @@ _ENDINGS = {"tum": (".tum", ".txt"), "csv": (".csv",), "npz": (".npz",)}  # of w
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns the exit code: 0 done, 1 the answer is "no", 2 wrong usage or bad input."""
+    arguments = argparse.Namespace(command=None)
     try:
-        arguments = _parser().parse_args(argv)
+        _parser().parse_args(argv, arguments)
         command: Callable[[argparse.Namespace], int | None] = arguments.command
         with np.errstate(over="ignore", invalid="ignore"):  # the run ends at the step where that is seen
             return command(arguments) or 0
@@ -39,7 +41,8 @@ def main(argv: list[str] | None = None) -> int:
     except MemoryError as error:
         return _refuse(f"not enough memory ({error or 'out of memory'}); ask for less: fewer particles, a shorter run")
     except KeyboardInterrupt:
-        return _refuse("interrupted; what was recorded so far is in the .partial.rrd file", 130)
+        records = getattr(arguments.command, "__name__", "") in ("_run", "fork")  # others leave nothing
+        return _refuse("interrupted" + records * "; what was recorded so far is in the .partial.rrd file", 130)
     except RuntimeError as error:
         from viz_estim.recording.viewer import ViewerError
 
@@ -52,6 +55,9 @@ def main(argv: list[str] | None = None) -> int:
 
 def entry() -> NoReturn:
     """The console script."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal of another alphabet shows ? for σ
     sys.exit(main())
 
 

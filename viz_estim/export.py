@@ -24,7 +24,10 @@ def export(run: Run, kind: str, out: Path) -> list[Path]:
         if run.labels:
             raise BadInput(f"{run.path}: a belief over labels has no trajectory; use --to csv")
         files = {out: run.mean, out.with_name(f"{out.stem}.truth{out.suffix}"): run.truth}
-        return [_write_tum(path, run, states) for path, states in files.items() if np.isfinite(states).any()]
+        known = {path: states for path, states in files.items() if np.isfinite(states).any()}
+        if not known:
+            raise BadInput(f"{run.path}: its states are no numbers (NaN); there is no trajectory to write")
+        return [_write_tum(path, run, states) for path, states in known.items()]
     if kind == "csv":
         names, columns = zip(*_series(run).items(), strict=True)
         return [_whole(out, lambda file: _write_csv(file, names, np.stack(columns, axis=1)), text=True)]

@@ -139,6 +139,8 @@ class Recording:
 
         Whether a truth is drawn is settled by the first step: give one there, of NaN if it is not known yet.
         """
+        if isinstance(time, np.ndarray) and time.size == 1:
+            time = time.item()
         if not isinstance(time, (int, float, np.number)):
             raise ValueError(f"step {self._count}: expected a time in seconds, got {type(time).__name__}")
         if not np.isfinite(time) or (self._times and time < self._times[-1]):
