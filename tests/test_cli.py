@@ -224,6 +224,7 @@ def test_stages_are_there_where_nothing_of_them_is_kept(cli: Cli, tmp_path: Path
         out = tmp_path / f"{every}.rrd"
         strict(cli("run", "se2-pf", "--every", every, "--out", out, "--json"))
         shown.append([strict(cli("show", out, "--step", step, "--json"))["stages"] for step in range(5)])
+        assert viz_estim.load(out).properties["every"] == every
     whole, thinned = shown
     assert [[stage["name"] for stage in stages] for stages in thinned] == [
         [stage["name"] for stage in stages] for stages in whole

@@ -242,7 +242,7 @@ def execute(planned: Plan, out: Path | None, *, every: int, live: str | None, pr
     if out is None:
         make_folder(path.parent)
     check_writable(path, suffix=".rrd")
-    properties = planned.properties(scenario)
+    properties = planned.properties(scenario) | {"every": every}
     with (
         claimed(partial_of(path)),
         Recorder(path, scenario, properties, every=every, live=live) as recorder,
