@@ -83,6 +83,14 @@ def test_a_time_may_be_an_array_of_one(tmp_path: Path) -> None:
     assert viz_estim.load(tmp_path / "a.rrd").time.tolist() == [0.5, 0.75]
 
 
+def test_the_stamps_of_a_clock_are_told_in_full(tmp_path: Path, cli: Cli) -> None:
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        for k in range(3):
+            rec.stage("update", mean=[1], cov=[[1]])
+            rec.step(time=1.7e9 + 0.5 * k)
+    assert "no step at 0.5 s; it holds 1700000000 to 1700000001 s" in cli("show", tmp_path / "a.rrd", "--time", 0.5).err
+
+
 def test_a_trajectory_without_a_number_is_refused(tmp_path: Path, cli: Cli) -> None:
     with viz_estim.record(tmp_path / "a.rrd", {"x": "m", "y": "m"}) as rec:
         rec.stage("update", mean=[np.nan] * 2, cov=np.eye(2))

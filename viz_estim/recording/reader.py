@@ -89,7 +89,10 @@ class Run:
         assert time is not None
         row = int(np.searchsorted(self.time, time + 5e-10, side="right")) - 1  # stamps are kept to the nanosecond
         if row < 0 or not time <= self.time[-1] + 1.0:
-            raise BadInput(f"{self.path}: no step at {time:g} s; it holds {self.time[0]:g} to {self.time[-1]:g} s")
+            first, last = (
+                f"{stamp:.6f}".rstrip("0").rstrip(".") for stamp in self.time[[0, -1]]
+            )  # those of a clock too
+            raise BadInput(f"{self.path}: no step at {time:.16g} s; it holds {first} to {last} s")
         return row
 
     def place(self, place: int) -> int:
