@@ -22,7 +22,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario, Tick, run
 from viz_estim.core.unscented import AugmentedFilter
 from viz_estim.diagnose import CODES, diagnose
-from viz_estim.diagnosis import evidence, signatures
+from viz_estim.diagnosis import evidence, geometry, signatures
 from viz_estim.diagnosis.axes import maps
 from viz_estim.diagnosis.finding import Finding, judge, level
 from viz_estim.recording.memory import collect
@@ -303,6 +303,14 @@ def test_a_run_that_failed_is_a_finding_at_its_step() -> None:
 
     found = diagnose(collect(scenario, run(replace(scenario, estimator=Raises()))))
     assert (found[0].code, found[0].severity, found[0].steps) == ("failed", "error", (51, 51))
+
+
+def test_an_arc_holds_its_angles_and_none_is_shorter() -> None:
+    rng = np.random.default_rng(0)
+    angles = rng.uniform(-np.pi, np.pi, (200, 1)) + rng.uniform(-1.4, 1.4, (200, 9))
+    start, arc = geometry._arc(angles)
+    np.testing.assert_allclose(arc, np.ptp(angles, axis=1), atol=1e-12)
+    np.testing.assert_allclose(np.exp(1j * start), np.exp(1j * angles.min(1)), atol=1e-12)
 
 
 def test_a_quaternion_off_the_sphere_is_seen_whatever_its_size() -> None:

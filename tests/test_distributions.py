@@ -19,6 +19,7 @@ CASES: dict[str, tuple[str, tuple[Any, ...]]] = {
     "chi2.isf": ("isf", (P, DOF)),
     "chi2.median": ("median", (DOF,)),
     "norm.sf": ("sf", (np.concatenate([X, -X]),)),
+    "norm.isf": ("isf", (P,)),
     "t.sf": ("sf", (np.concatenate([X, -X]), DOF)),
     "f.sf": ("sf", (X, DOF[1:], DOF[::-1][:-1])),
     "f.isf": ("isf", (P[1:], DOF[1:], DOF[::-1][:-1])),  # scipy's own is right to eight digits at 1e-9

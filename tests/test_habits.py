@@ -154,8 +154,8 @@ def test_a_prediction_that_is_done_twice_is_told(make: Callable[[], Scenario]) -
 class Adding:
     """Adds Q in the update, in place of the prediction or besides."""
 
-    def __init__(self, filter: Any, besides: bool) -> None:
-        self.filter, self.besides = filter, besides
+    def __init__(self, filter: Any, besides: bool, times: float = 1.0) -> None:
+        self.filter, self.besides, self.times = filter, besides, times
 
     def step(self, belief: Gaussian, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
         Q = self.filter.process_noise(belief.mean, tick)
@@ -164,7 +164,9 @@ class Adding:
             for stage in moving.step(belief, part, rng):
                 made = stage
                 if isinstance(stage, Update):
-                    made = replace(stage, belief=replace(stage.belief, cov=stage.belief.cov + Q))  # type: ignore[arg-type, call-arg]
+                    after: Any = stage.belief
+                    added = self.times * self.filter.process_noise(after.mean, tick)  # of the heading after the update
+                    made = replace(stage, belief=replace(after, cov=after.cov + added))
                 yield made
                 belief = made.belief  # type: ignore[assignment]
 
@@ -178,9 +180,20 @@ def test_a_q_in_the_update_is_told_though_it_is_small(besides: bool, words: str)
     assert words in next(finding.cause for finding in findings if finding.code == "update")
 
 
-def test_a_mirrored_cloud_is_told_where_the_true_pose_shows_it() -> None:
-    data = scan.scan(None, np.random.default_rng(2), points=1500, planar=True)
-    scenario = scan.scan_icp(replace(data, X=data.X[:, ::-1]))
+@pytest.mark.parametrize(
+    ("besides", "times", "words"), [(True, 1, "and Q besides"), (True, 4, "4× Q"), (False, 1, "no process")]
+)
+def test_a_q_in_the_update_is_told_of_another_heading_and_another_time(besides: bool, times: float, words: str) -> None:
+    scenario = drive(16.0)
+    findings = found(replace(scenario, estimator=Adding(scenario.estimator, besides, times)))
+    assert words in next(finding.cause for finding in findings if finding.code == "update")
+
+
+@pytest.mark.parametrize("planar", [True, False])
+@pytest.mark.parametrize("seed", [2, 3, 5])
+def test_a_mirrored_cloud_is_told_where_the_true_pose_shows_it(seed: int, planar: bool) -> None:
+    data = scan.scan(None, np.random.default_rng(seed), points=600, planar=planar)
+    scenario = scan.scan_icp(replace(data, X=data.X[:, [1, 0] if planar else [1, 0, 2]]))
     (finding,) = mirrored.mirrored(evidence.case(collect(scenario, run(scenario))))
-    assert finding.evidence["map"] == "axes +y +x"
+    assert finding.evidence["map"] == ("axes +y +x" if planar else "axes +y +x +z")
     assert "mirrored" in finding.cause

@@ -42,6 +42,10 @@ class norm:
     def sf(x: Any) -> Any:
         return special.ndtr(-np.asarray(x, float))
 
+    @staticmethod
+    def isf(p: Any) -> Any:
+        return -special.ndtri(np.asarray(p, float))
+
 
 class t:
     """Student's t with k > 0 degrees of freedom; NaN for k ≤ 0."""

@@ -16,7 +16,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, SO2, SO3, wrap
 from viz_estim.diagnosis.durations import by_biases, whole
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import SURELY, level
+from viz_estim.diagnosis.finding import EXPLAINED, level
 
 _FEWEST = 20
 WINDOW = 0.1  # s
@@ -102,7 +102,7 @@ def turns_of_means(case: Case, window: float) -> tuple[str, Moves, Array] | None
     rates = [case.space.at[k] for k, part in case.space.parts.items() if list(part.axis_units) == ["rad/s"] * 3]
     for rate in rates:
         by_state = before[fine, rate] * run.dt[row[fine], None]
-        if np.square(told[fine] - by_state).sum() < (1 - SURELY) * np.square(told[fine]).sum():
+        if np.square(told[fine] - by_state).sum() < (1 - EXPLAINED) * np.square(told[fine]).sum():
             return None  # it turns as the state says, by a rate that readings have taught it
     told -= by_biases(case, table, by, name)
     rows = np.flatnonzero(fine)[: fine.sum() // n * n].reshape(-1, n)

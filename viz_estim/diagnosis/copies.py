@@ -14,6 +14,7 @@ from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import Finding, at_steps
 
 _FEWEST = 3  # steps at which it is seen
+_ROUNDED = 8 * float(np.finfo(np.float32).eps)  # of logarithms that were normalised, of the coarser floats
 
 
 def together(case: Case) -> Iterator[Finding]:
@@ -58,7 +59,8 @@ def weighed_again(case: Case) -> Iterator[Finding]:
                 continue  # a cloud that was thinned
             kept, drawn = before[of], (of != np.arange(len(of))).any()
             shift = kept - after
-            if drawn and np.ptp(shift[np.isfinite(shift)]) < 1e-9 * max(1.0, float(np.abs(kept).max())):
+            size = max(float(np.abs(w[np.isfinite(w)]).max(initial=1.0)) for w in (kept, after))
+            if drawn and np.ptp(shift[np.isfinite(shift)]) < _ROUNDED * size:
                 steps.append(int(table.step[row]))
         if len(steps) >= _FEWEST:
             yield Finding(

@@ -76,7 +76,9 @@ def claims(case: Case) -> Iterator[Finding]:
     """An update that leaves less than a reading can: P⁺ ≥ P − C·S⁻¹·Cᵀ for any gain (Kalman's is the best).
 
     Carried to the tangent space at the new mean. By the eigenvalues of P⁺ over that bound, which no sound update has
-    below 1 by more than rounding: half of the digits, times the ratio of the variances before and after.
+    below 1 by more than rounding: half of the digits, times the ratio of the variances before and after. Over the run
+    they multiply, and are told from the factor on that as many readings can tell of a variance, 1 + √(2/N); an error
+    where in the middle one alone is GROSS.
     """
     for table in case.run.stages.values():
         if not {"innovation.cov", "cov"} <= table.values.keys() or not tells_gain(table):
@@ -100,12 +102,14 @@ def claims(case: Case) -> Iterator[Finding]:
         inside = np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, table.cov[rows][fine]), 1, 2))
         ratio = np.linalg.eigvalsh(0.5 * (inside + np.swapaxes(inside, 1, 2)))[:, 0]
         shrunk = np.diagonal(before[rows][fine], axis1=1, axis2=2) / np.diagonal(least[fine], axis1=1, axis2=2)
-        bad = ratio < 1 - np.minimum(_HALF * 100 * shrunk.max(1), 0.5)
-        if bad.sum() > 1:
+        bad = ratio < 1 - np.minimum(_HALF * shrunk.max(1), 1 - 1 / GROSS)
+        claimed = -np.log(np.maximum(ratio[bad], 1e-300)).sum()
+        if bad.sum() > 1 and claimed > np.log1p(np.sqrt(2 / (len(ratio) * S.shape[-1]))):
             of = table.step[rows][fine][bad]
             worst = float(ratio[bad].min())
             yield Finding(
-                "covariance", "error" if np.median(ratio[bad]) < 0.9 else "warning", None, (int(of[0]), int(of[-1])),
+                "covariance", "error" if GROSS * np.median(ratio[bad]) < 1 + _HALF else "warning", None,
+                (int(of[0]), int(of[-1])),
                 {"kind": "claims", "least_ratio": worst, "stage": table.name, "count": int(bad.sum())},
                 f"at {int(bad.sum())} updates the covariance shrinks by more than the reading can tell (down to "
                 f"{worst:.2g} of the least variance that any gain leaves)",
@@ -157,7 +161,7 @@ def bounds(case: Case) -> Iterator[Finding]:
         sigma = np.sqrt(np.maximum(np.diagonal(run.cov, axis1=1, axis2=2)[:, axes], 0)).max(1)
         falls = sigma[ends[1:]] / np.maximum(sigma[ends[:-1]], 1e-300)
         deaf = sigma[rows] < np.finfo(float).eps * np.abs(run.mean[rows][:, at]).max()
-        if sigma[rows[0]] > 0 and ((falls < 0.999 * fastest).all() or (deaf[-1] and not deaf[0])):
+        if sigma[rows[0]] > 0 and ((falls < (1 - _HALF) * fastest).all() or (deaf[-1] and not deaf[0])):
             step = int(run.step[rows[int(np.argmax(deaf))]] if deaf.any() else run.step[ends[0]])
             yield Finding(
                 "covariance", "error", None, (step, int(run.step[rows[-1]])), {"kind": "collapsed", "part": name},
@@ -165,7 +169,11 @@ def bounds(case: Case) -> Iterator[Finding]:
                 f"give {name} process noise: without any, each reading only makes it surer",
             )  # fmt: skip
         gains = np.diff(sigma[ends] ** 2) / np.maximum(np.diff(elapsed), 1e-12)
-        if (gains[1:] > 0.999 * gains[:-1]).all() and gains[0] > 0 and sigma[rows[-1]] ** 2 > 2 * sigma[rows[0]] ** 2:
+        if (
+            (gains[1:] > (1 - _HALF) * gains[:-1]).all()
+            and gains[0] > 0
+            and sigma[rows[-1]] ** 2 > GROSS * sigma[rows[0]] ** 2
+        ):
             evidence = {
                 "kind": "growing", "part": name, "start": float(sigma[rows[0]]), "end": float(sigma[rows[-1]])
             }  # fmt: skip

@@ -69,7 +69,7 @@ _ORDER: tuple[Severity, ...] = ("error", "warning", "note")
 
 _BUDGET: dict[Severity, float] = {"error": 1e-4, "warning": 0.05}  # false alarms a run
 GROSS = 2.0  # the factor on a variance from which on it is an error
-SURELY = 0.95  # of a misfit explained: no error of a linearisation looks like that
+EXPLAINED = 1 - 1 / GROSS  # of a misfit, by its cause: without that the squares are wrong by less than GROSS
 SHEET = 0.05  # of a factor: what a gyro's or a wheel's data sheet leaves to a calibration
 ODDS = 20.0  # by which one cause must be likelier than another to be named alone: strong (Kass and Raftery 1995)
 _FAMILIES = 36  # statistical checks: each has an equal share, and shares it out among what it tests

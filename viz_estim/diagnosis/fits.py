@@ -11,6 +11,7 @@ import numpy as np
 from viz_estim.core.distributions import chi2, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
+from viz_estim.diagnosis.finding import level
 
 STRETCHES = 20
 
@@ -87,7 +88,8 @@ class Fitted(NamedTuple):
 
 
 def fitted(one: Against, design: Array) -> Fitted:
-    """r (M, m) on a design (M, m, k) by least squares in R; explained: the share of Σ|r|² beyond what noise is."""
+    """r (M, m) on a design (M, m, k) by least squares in R; explained: the share of Σ|r|² beyond what noise may be, its
+    χ² quantile at a warning's level."""
     X, y = white(one, design), white(one, one.r)
     M, m, k = X.shape
     A = np.einsum("tmi,tmj->ij", X, X)
@@ -107,9 +109,10 @@ def fitted(one: Against, design: Array) -> Fitted:
     error, dof = np.where(plain, np.sqrt(np.diag(model)), error), np.where(plain, M - k, B - 1)
     p = 2 * t.sf(np.abs(beta) / np.maximum(error, 1e-300), dof)
     own, rest = float((y**2).sum()), float((left**2).sum())
+    noise = float(chi2.isf(level("warning", 1), M * m))
     # In the least variance that explains the rest, so that an R that is too small does not count for a cause.
     gain = 0.5 * M * m * np.log(own / max(rest, 1e-300))
-    return Fitted(beta, p, error, dof, gain, (own - rest) / max(own - min(M * m, rest), 1e-300))
+    return Fitted(beta, p, error, dof, gain, (own - rest) / max(own - min(noise, rest), 1e-300))
 
 
 class Slope(NamedTuple):

@@ -19,7 +19,7 @@ from viz_estim.diagnosis.axes import maps
 from viz_estim.diagnosis.clouds import WINDOW
 from viz_estim.diagnosis.durations import by_biases, whole
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import ODDS, SURELY, Finding, judge
+from viz_estim.diagnosis.finding import EXPLAINED, ODDS, Finding, judge
 from viz_estim.scenarios.imu_health import GRAVITY
 
 _UP = np.array([0.0, 0.0, GRAVITY])
@@ -98,7 +98,7 @@ def forces(case: Case) -> Iterator[Finding]:
     left = min(one[0] for one in tried)
     explained = 1 - left / max(own, 1e-300)
     gain = 0.5 * truly.size * float(np.log(own / max(left, 1e-300)))
-    if explained < SURELY or judge(float(np.exp(-min(gain, 700.0))), len(tried), large=True) != "error":
+    if explained < EXPLAINED or judge(float(np.exp(-min(gain, 700.0))), len(tried), large=True) != "error":
         return
     # Of those that explain it as well (a force along one axis tells nothing of the others) the least change.
     alike = [one for one in tried if 0.5 * truly.size * np.log(one[0] / max(left, 1e-300)) < np.log(ODDS)]

@@ -80,8 +80,8 @@ def _wide(case: Case, readings: Readings, g: float) -> Iterator[Finding]:
     fewer refusals than Binomial(N, 1 − g) has."""
     name, dof, N = readings.name, readings.dof, len(readings)
     refused, gate = int((~readings.used).sum()), gate_name(case, readings.name)
-    # Of the same numbers: a solve loses some digits, and no more.
-    passed = readings.used & (readings.nis > chi2.ppf(g, dof) * (1 + 1e-6))
+    # Of the same numbers, of which a solve may lose half of the digits, and no more.
+    passed = readings.used & (readings.nis > chi2.ppf(g, dof) * (1 + np.sqrt(np.finfo(float).eps)))
     if passed.any():
         rows = np.flatnonzero(passed)
         yield Finding(

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from viz_estim.core.spaces import SO3, Euclidean
+from viz_estim.core.quaternions import Array
+from viz_estim.core.spaces import SO2, SO3, Euclidean, Product, Space, wrap
 from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.covariance import epsilon
 from viz_estim.diagnosis.evidence import Case, tells_reading
@@ -14,32 +15,65 @@ from viz_estim.diagnosis.finding import Finding, level
 from viz_estim.diagnosis.kinematics import imu_axes, scale
 from viz_estim.recording.layout import leaves
 
-_BURST, _BESIDE = 100.0, 0.3  # of the usual S; rad from ±π
-
 
 def wraps(case: Case) -> Iterator[Finding]:
-    """Innovations beyond a half turn, which no wrapped difference is; or an S that bursts beside ±π.
-
-    The second is what sigma points do that lie on both sides of the seam, where their plain mean is a quarter turn off.
-    """
+    """Innovations beyond a half turn, which no wrapped difference is; or an expected angle that is the plain mean of
+    sigma points on both sides of ±π (`_astride`). Neither can be by chance."""
     for name, readings in case.sensors.items():
         for i, unit in enumerate(readings.space.axis_units):
             if unit != "rad" or isinstance(readings.space, SO3):
                 continue
-            variance, wide = readings.cov[:, i, i], np.zeros(len(readings), bool)
-            if readings.z.shape == readings.residual.shape:
-                wide = (variance > _BURST * np.median(variance)) & (np.abs(readings.z[:, i]) > np.pi - _BESIDE)
-            rows = np.flatnonzero((np.abs(readings.residual[:, i]) > np.pi) | wide)
-            if len(rows):
-                axis = readings.space.axes[i]
-                steps = int(readings.step[rows[0]]), int(readings.step[rows[-1]])
+            axis = readings.space.axes[i]
+            steps = set(readings.step[np.abs(readings.residual[:, i]) > np.pi].tolist()) | _astride(case, name, i)
+            if steps:
                 yield Finding(
-                    "angle_wrap", "error", name, steps, {"component": axis, "count": len(rows)},
-                    f"innovations of {name} ({axis}) jump by a turn, first at step {steps[0]}: the difference of two "
+                    "angle_wrap", "error", name, (min(steps), max(steps)), {"component": axis, "count": len(steps)},
+                    f"innovations of {name} ({axis}) jump by a turn, first at step {min(steps)}: the difference of two "
                     "angles is not wrapped",
                     "wrap the residual to [−π, π), by SO2().minus, not z − h(x)",
                 )  # fmt: skip
                 break
+
+
+def _astride(case: Case, sensor: str, i: int) -> set[int]:
+    """The steps at which a sensor's sigma points lie on both sides of ±π, by what the mean of this angle is.
+
+    As numbers they span more than a half turn and on the circle less, all but its largest arc without a point (Mardia
+    and Jupp 2000, section 2.3); and the mean lies further from the middle of their arc than the arc is long, while that
+    of wrapped angles lies inside.
+    """
+    steps: set[int] = set()
+    for table in case.run.stages.values():
+        space, points = table.spaces.get("innovation"), table.values.get("mapped.points")
+        if not isinstance(space, Product) or points is None or points.shape[-1] != len(space.names):
+            continue
+        for name, part in space.parts.items():
+            k = _number(part, i) if name.partition("/")[0] == sensor and i < len(part.axes) else None
+            if k is None:
+                continue
+            k += space.at[name].start
+            start, arc = _arc(points[..., k])
+            apart = np.abs(wrap(table.values["innovation.predicted"][:, k] - start - 0.5 * arc)) > arc
+            steps |= set(table.step[(np.ptp(points[..., k], axis=1) > np.pi) & (arc < np.pi) & apart].tolist())
+    return steps
+
+
+def _number(part: Space, i: int) -> int | None:
+    """Which number of a space is its direction i; None where it is no plain angle."""
+    axis = 0
+    for _, leaf, at in leaves(part) if isinstance(part, Product) else [("", part, slice(0, len(part.names)))]:
+        if i < axis + len(leaf.axes):
+            return at.start + i - axis if isinstance(leaf, SO2 | Euclidean) else None
+        axis += len(leaf.axes)
+    return None
+
+
+def _arc(angles: Array) -> tuple[Array, Array]:
+    """Where the shortest arc begins that holds angles (M, N), and how long it is (M,), in rad."""
+    x = np.sort(wrap(angles), axis=1)
+    gaps = np.diff(x, axis=1, append=x[:, :1] + 2 * np.pi)
+    last, row = np.argmax(gaps, axis=1), np.arange(len(x))
+    return x[row, (last + 1) % x.shape[1]], 2 * np.pi - gaps[row, last]
 
 
 def quaternion_norms(case: Case) -> Iterator[Finding]:

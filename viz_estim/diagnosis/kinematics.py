@@ -149,6 +149,13 @@ def _blamed(case: Case, both: Imu) -> str:
             if known.any():
                 up = quaternions.rotate(quaternions.conjugate(truth[known]), _UP)
                 seen = both.force[known] / np.linalg.norm(both.force[known], axis=1, keepdims=True)
-                return "accel" if float((up * seen).sum(1).mean()) < 0.7 else "gyro"
+                return _upright(seen.T @ up / len(up))
     level_at_rest = both.force[: max(1, len(both.force) // 20)].mean(0)
-    return "accel" if level_at_rest[2] < 0.5 * np.linalg.norm(level_at_rest) else "gyro"
+    return _upright(np.outer(level_at_rest / np.linalg.norm(level_at_rest), _UP))
+
+
+def _upright(seen_up: Array) -> str:
+    """`accel` where with its axes as others it sees up GROSS nearer, by the mean of seen·upᵀ (3, 3); else the gyro.
+    The mean square of their distance is 2·(1 − trace)."""
+    others = [float((A * seen_up).sum()) for title, A in maps(3, "rad/s") if title.startswith("axes")]
+    return "accel" if 1 - float(np.trace(seen_up)) > GROSS * (1 - max(others)) else "gyro"

@@ -23,6 +23,7 @@ _LARGE = GROSS**0.5 - 1
 # Of the squares of what a sampled prediction leaves, n' − n of two draws, the motion in between holds n and not n': it
 # explains at most a half, while it explains all that a wrong Jacobian leaves.
 _HALF = 0.5
+_DIGITS = float(np.sqrt(np.finfo(float).eps))  # of the numbers: a smaller difference of two has lost half of them
 _FEWEST = 10
 
 
@@ -69,7 +70,7 @@ def _left(change: Array, expected: Array, may: Array, largest: float) -> tuple[f
     """
     size = np.linalg.norm(change, axis=1)
     missed = np.linalg.norm(np.maximum(np.abs(change - expected) - may, 0.0), axis=1)
-    rows = (size > 1e6 * np.finfo(float).eps * max(largest, 1.0)) & (np.linalg.norm(may, axis=1) < _HALF * size)
+    rows = (size > _DIGITS * max(largest, 1.0)) & (np.linalg.norm(may, axis=1) < _HALF * size)
     if rows.sum() < _FEWEST:
         return 0.0, 0
     return float(np.median(missed[rows] / size[rows])), int(rows.sum())
@@ -115,7 +116,7 @@ def predicted(case: Case) -> Iterator[Finding]:
         largest = float(np.abs(table.mean).max())
         left, count = _left(change - moved, expected - moved, may, largest)
         size = np.median(np.linalg.norm(rest, axis=1))
-        if size > 1e6 * np.finfo(float).eps * max(largest, 1.0) and ratio > unfelt and drift < _HALF:
+        if size > _DIGITS * max(largest, 1.0) and ratio > unfelt and drift < _HALF:
             evidence = {"size_in_Q": ratio, "stage": table.name}
             yield Finding(
                 "noisy_prediction", "error", None, steps, evidence,

@@ -15,12 +15,11 @@ from viz_estim.diagnosis.against import slip as bound
 from viz_estim.diagnosis.axes import maps
 from viz_estim.diagnosis.durations import composed, whole
 from viz_estim.diagnosis.evidence import Case, transitions
-from viz_estim.diagnosis.finding import GROSS, SHEET, SURELY, Finding, judge
+from viz_estim.diagnosis.finding import EXPLAINED, ODDS, SHEET, Finding, judge
 from viz_estim.diagnosis.fits import slope
 from viz_estim.diagnosis.naming import likeliest, named, of_motion
 
 _WORLD = "the world's axes"
-_ALIKE = 1.01  # of the squares that are left: as well explained
 
 
 def prediction(case: Case) -> Iterator[Finding]:
@@ -141,7 +140,7 @@ def _exchanged(truly: Array, told: Array, of: np.ndarray) -> Finding | None:
     left = np.square(truly - told[:, [2, 1, 0]])[:, [0, 2]].sum(0)
     explained = float(np.mean(1 - left / np.maximum(own, 1e-300)))
     gain = 0.5 * len(truly) * float(np.log(own / np.maximum(left, 1e-300)).sum())
-    if explained < SURELY or judge(float(np.exp(-min(gain, 700.0))), 1, large=True) != "error":
+    if explained < EXPLAINED or judge(float(np.exp(-min(gain, 700.0))), 1, large=True) != "error":
         return None
     return Finding(
         "process_model", "error", None, (int(of[0]), int(of[-1])),
@@ -176,8 +175,7 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Ar
     back = float(np.square(truly - mapped).sum())
     if what != _WORLD and not (forces.foreseen(told, best) and forces.foreseen(truly, back)):
         return None
-    least = SURELY if in_world is None else 1 - 1 / GROSS
-    if explained < least or judge(float(np.exp(-min(gain, 700.0))), 60, large=True) != "error":
+    if explained < EXPLAINED or judge(float(np.exp(-min(gain, 700.0))), 60, large=True) != "error":
         return None
     if what == _WORLD:
         return Finding(
@@ -224,6 +222,8 @@ def _moves_as(
         both = (ends[0], forth.error * ends[0] ** 2), (ends[1], aback.error)
         known = [(f, error) for f, error in both if likeliest(f, told_as, error)]
         factor, error = known[0] if known else min(both, key=lambda one: abs(one[0] - 1))
+        if abs(np.log(factor)) < np.log1p(SHEET) if factor > 0 else False:
+            return  # as good as 1
         p = max(forth.p_beyond(0.0), aback.p_beyond(0.0))
         severity = judge(p, tests, large=max(forth.p_beyond(SHEET), aback.p_beyond(SHEET)))
         cause = f"{label} is predicted to move by {factor:.3g}× what it does: {named(factor, told_as, error)}"
@@ -239,7 +239,7 @@ def _moves_as(
             f"the prediction misses a steady {drift:+.3g} {rate} of {label}: the control that moves it has a bias, "
             "or a force is missing from the model"
         )
-        if left_factor < _ALIKE * left_drift:  # it was always told the same
+        if 0.5 * len(w) * np.log(left_factor / max(left_drift, 1e-300)) < np.log(ODDS):  # it was always told the same
             cause += f"; or it moves by {1 / (1 + beta):.3g}× what it does, which looks alike at one speed"
         remedy = f"calibrate that bias ({drift:+.3g} {rate}), or add it to the state and let the filter estimate it"
         evidence = {"component": label, "drift": drift, "p": p_drift}

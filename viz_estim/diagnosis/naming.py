@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from viz_estim.diagnosis.axes import units
-from viz_estim.diagnosis.finding import ODDS, SHEET
+from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET
 
 _FAR = 3.0  # standard deviations: one of 370 right names is lost by it
 _CALIBRATED = 0.5 * SHEET  # of a factor, one standard deviation
@@ -42,4 +42,5 @@ def of_motion(unit: str, dt: float, times: int = 1) -> dict[str, float]:
         known[f"the prediction is done {times} times a step, each over the whole of it"] = float(times)
     else:
         known["as if the prediction were done twice a step"] = 2.0
-    return known | ({"a dt that is multiplied once too often": dt} if dt > 0 else {})
+    # A dt of about 1 s is no factor.
+    return known | ({"a dt that is multiplied once too often": dt} if 0 < dt < 1 / GROSS else {})

@@ -86,6 +86,13 @@ def _distances(case: Case) -> Iterator[Distances]:
             rows &= np.isfinite(true).all(1) & np.isfinite(z) & np.isfinite(predicted) & np.isfinite(mean).all(1)
             if rows.sum() < FEWEST:
                 continue
-            place = distance_place(mean[rows][:, position], mean[rows][:, beside], predicted[rows])
+            std = float(
+                np.sqrt(
+                    np.median(
+                        table.values["innovation.noise"][rows, kind.axes_at[name].start][:, kind.axes_at[name].start]
+                    )
+                )
+            )
+            place = distance_place(mean[rows][:, position], mean[rows][:, beside], predicted[rows], std)
             if place is not None:
                 yield Distances(name, table.step[rows], true[rows], z[rows], place)

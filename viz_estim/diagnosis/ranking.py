@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from viz_estim.core.distributions import chi2
-from viz_estim.diagnosis.finding import SYMPTOMS, Finding, Severity
+from viz_estim.diagnosis.finding import SYMPTOMS, Finding, Severity, level
 
 _SENT = ("particles_far", "particles_collapsed")  # particles go where the readings and the motion send them
 
@@ -51,7 +51,7 @@ def _of_the_noise(start: Finding, found: list[Finding]) -> Finding:
     """A start that was made of readings is as far off as their R is too small: then that is the cause."""
     for f in found:
         factor, by_R = f.evidence.get("factor_on_R"), f.evidence.get("gain_by_R", 0.0)
-        held = factor and chi2.sf(start.evidence["nees"] / factor, start.evidence["dof"]) > 0.01
+        held = factor and chi2.sf(start.evidence["nees"] / factor, start.evidence["dof"]) > level("warning", 1)
         if f.code == "overconfident" and held and by_R >= f.evidence.get("gain_by_Q", 0.0):
             return _softened(start, f)
     return start

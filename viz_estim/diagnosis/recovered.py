@@ -99,9 +99,9 @@ def _distances(
     return None
 
 
-def distance_place(position: Array, beside: Array, d: Array) -> Array | None:
+def distance_place(position: Array, beside: Array, d: Array, std: float) -> Array | None:
     """The place (k,) from which d (M,) are s·|p − L| + b of positions p (M, k), the scale s and the bias b each one of
-    other numbers of the state (M, q), or none; None where no such place gives them to a thousandth."""
+    other numbers of the state (M, q), or none; None where no place gives them as `exact` as a noise of std lets."""
     one, none = np.ones(len(d)), np.zeros(len(d))
     for b in [none, *beside.T]:
         for s in [one, *beside.T]:
@@ -113,7 +113,7 @@ def distance_place(position: Array, beside: Array, d: Array) -> Array | None:
                 return None
             _, fitted, _, coefficients = line
             off = np.sqrt(np.maximum(fitted + (position**2).sum(1), 0.0)) - own
-            if np.sqrt(np.mean(off**2)) < 1e-3 * np.std(own) and (own > 0).all():
+            if np.sqrt(np.mean((s * off / std) ** 2)) < exact(len(d)) and (own > 0).all():
                 return np.asarray(-0.5 * coefficients[:-1])
     return None
 

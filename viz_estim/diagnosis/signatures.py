@@ -20,14 +20,11 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
 from viz_estim.diagnosis import tuning
 from viz_estim.diagnosis.evidence import Case, jacobians, once, parameter, tells_gain, transitions
-from viz_estim.diagnosis.finding import Finding, judge
+from viz_estim.diagnosis.finding import EXPLAINED, Finding, judge, level
 from viz_estim.recording.tables import StageTable
 
 _BACK = 3  # readings over which a rate of change is taken: backwards, so that it is known before the innovation
 _STRETCHES = 20
-# Of the innovations' excess over what they should be, at least, for a fault to be named as its cause: a model that is
-# wrong in another way looks a little like each. It chooses among causes; of false alarms it can but take some away.
-_EXPLAINS = 0.2
 
 
 class Fault(NamedTuple):
@@ -114,10 +111,12 @@ def _foreseen(case: Case, name: str, axis: str) -> float:
 
 def _likelier(case: Case, fault: Fault) -> bool:
     """Whether the fault, with S as large as what it leaves, explains the innovations better than another R or Q does
-    (`tuning`), by the greater likelihood, and explains a fair share of what they are too large by."""
+    (`tuning`), by the greater likelihood, and is the cause of what they are too large by: a model that is wrong in
+    another way looks a little like each. By as much as they are too large for sure, χ²'s quantile at a warning's
+    level. It chooses among causes; of false alarms it can but take some away."""
     total = sum(float(r.nis.sum()) for r in case.sensors.values())
     count = sum(r.dof * len(r) for r in case.sensors.values())
-    if fault.score**2 < _EXPLAINS * (total - count):
+    if fault.score**2 < EXPLAINED * (total - chi2.isf(level("warning", 1), count)):
         return False
     left = max(total - fault.score**2 * max(1.0, _misfit(case)), 1e-300)
     gain = 0.5 * (total - count - count * np.log(left / count))

@@ -15,12 +15,8 @@ from viz_estim.diagnosis import causes, frames
 from viz_estim.diagnosis.against import against
 from viz_estim.diagnosis.causes import Cause
 from viz_estim.diagnosis.evidence import Case, parameter
-from viz_estim.diagnosis.finding import Finding, Severity, judge
+from viz_estim.diagnosis.finding import EXPLAINED, SHEET, Finding, Severity, judge
 from viz_estim.diagnosis.fits import Against
-
-_SMALL = 0.1  # of R's standard deviation: a hundredth of the squares that noise alone has
-# Of what is off beyond the noise, at least; it chooses among causes, and of false alarms it can but take some away.
-_SHARE = 0.2
 
 
 def sensors(case: Case) -> Iterator[Finding]:
@@ -30,9 +26,11 @@ def sensors(case: Case) -> Iterator[Finding]:
     log-likelihood less ½·k·log M is told (Schwarz 1978), summed over the sensor's targets and parts, which one delay or
     one exchange concerns alike. p is of the t-test of the worst coefficient with a variance by 20 stretches of the run
     (Liang and Zeger 1986), so that truth and noise may be coloured. Large is a bias or a factor that doubles the
-    squared error with which the filter foresees the reading, and a lag beyond half of a step. A cause must be
-    larger than the model's own error, and than a tenth of the noise, which adds a hundredth to its squares: an effect
-    that is smaller matters to no filter.
+    squared error with which the filter foresees the reading, and a lag beyond half of a step.
+
+    Which causes are named is a matter of size and not of chance, of which with enough readings none is left: a cause
+    must be larger than the model's own error, must explain EXPLAINED of what is off beyond the noise, and must make the
+    squared error with which the filter foresees the reading larger by SHEET at least (`_small`).
     """
     those = against(case)
     tests = sum(len(one.space.axes) + 2 for one in those)
@@ -40,11 +38,11 @@ def sensors(case: Case) -> Iterator[Finding]:
     total: dict[tuple[str, str], float] = {}
     found: dict[tuple[str, str], list[tuple[float, Against, Cause, Severity]]] = {}
     for one in those:
-        name, slip = one.name.partition("/")[0], 2 * float(np.median(one.slip))
+        name, slip, small = one.name.partition("/")[0], 2 * float(np.median(one.slip)), _small(one)
         for kind, cause in _causes(one, those, interval):
             severity, score = judge(cause.p, tests, large=cause.large), cause.score(len(one.step))
             total[name, kind] = total.get((name, kind), 0.0) + max(score, 0.0)
-            if severity and cause.size > max(slip, _SMALL) and cause.explained > _SHARE:
+            if severity and cause.size > max(slip, small) and cause.explained > EXPLAINED:
                 found.setdefault((name, kind), []).append((score, one, cause, severity))
     for name in dict.fromkeys(name for name, _ in found):
         likeliest = max((key for key in found if key[0] == name), key=lambda key: total[key])
@@ -55,6 +53,13 @@ def sensors(case: Case) -> Iterator[Finding]:
         known = parameter(case.run, f"{name}_bias")
         estimated = f"set {known[0]}=estimate; or " if known and known[1] != "estimate" and not cause.known else ""
         yield Finding(cause.code, severity, name, steps, evidence, cause.cause, estimated + cause.remedy)
+
+
+def _small(one: Against) -> float:
+    """The size, in standard deviations of R, from which on an effect adds the share SHEET to the squared error with
+    which the filter foresees the reading: what is smaller matters to no filter."""
+    R = np.diagonal(one.noise, axis1=1, axis2=2)
+    return float(np.sqrt(SHEET * np.mean(one.foreseen / R)))
 
 
 def _causes(one: Against, those: list[Against], interval: float) -> Iterator[tuple[str, Cause]]:

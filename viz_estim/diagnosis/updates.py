@@ -4,7 +4,8 @@ Kalman (1960): of the reading z, its prediction ẑ, P, C = P·Hᵀ and R before
 S = CᵀP⁻¹C + R, K = C·S⁻¹, x⁺ = x ⊞ K·ν and P⁺ = P − K·Cᵀ − C·Kᵀ + K·S·Kᵀ (of any gain; Gelb 1974, eq. 4.2-12). All of
 these are recorded, so that each line is held against what follows from the others: no chance is in it, and no truth is
 needed. A matrix is compared by the eigenvalues of the one over the other, which are 1 where they agree. A deviation is
-told from the size on that as many readings can tell of a variance, 1 ± √(2/N), and is an error where it is GROSS.
+told from the size on that as many readings can tell of a variance, 1 ± √(2/N), and is an error where it is GROSS. A
+line is taken for one that is known to be mistaken where it is off that by less than this too, and than SHEET.
 """
 
 from __future__ import annotations
@@ -17,14 +18,12 @@ import numpy as np
 from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
-from viz_estim.diagnosis.covariance import sound
+from viz_estim.diagnosis.covariance import epsilon, sound
 from viz_estim.diagnosis.evidence import Case, tells_gain, tells_reading
-from viz_estim.diagnosis.finding import GROSS, Finding, Severity
+from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, Severity
 from viz_estim.recording.tables import StageTable
 
 _FEWEST = 3
-_ALIKE = 1e-3  # of a matrix: that it is this other one, but for rounding
-_ROUNDED = 1e-9  # of a covariance: half of the digits, for what is a difference of two
 
 
 class Told(NamedTuple):
@@ -41,6 +40,16 @@ class Told(NamedTuple):
     moved: Array
     after: Array
 
+    @property
+    def told(self) -> float:
+        """The share of a variance that as many readings tell."""
+        return float(np.sqrt(2 / (len(self.step) * self.S.shape[-1])))
+
+    @property
+    def near(self) -> float:
+        """The share by which a line may miss one that is known to be mistaken, and be that one."""
+        return min(self.told, SHEET)
+
 
 def updates(case: Case) -> Iterator[Finding]:
     """The first of an update's lines that does not hold: those after it are made of it."""
@@ -54,7 +63,7 @@ def updates(case: Case) -> Iterator[Finding]:
                 _spread(told, points),
                 _gain(told),
                 _mean(told),
-                _added(told, _noise(case, told.step)) or _cov(told),
+                _added(told, _noise(case, told.step), list(case.space.axes_at.values())) or _cov(told),
             ]
             found = [_residual(told) if reading else None, *lines]
             for severity, what, cause, remedy in [one for one in found if one][:1]:
@@ -98,7 +107,7 @@ def _told(case: Case, table: StageTable) -> Told | None:
 def _residual(told: Told) -> _Line | None:
     """ν = z ⊟ ẑ, and not the other way round. Angles that are not wrapped are `geometry.wraps`' matter."""
     size = np.linalg.norm(told.residual, axis=1)
-    sign = np.linalg.norm(told.residual + told.difference, axis=1) < _ALIKE * size
+    sign = np.linalg.norm(told.residual + told.difference, axis=1) < told.near * size
     if not sign[size > 0].all() or not (size > 0).any():
         return None
     return (
@@ -113,7 +122,7 @@ def _spread(told: Told, points: bool) -> _Line | None:
     spread = H @ told.C
     low, high = _ratios(told.S, spread + told.R)
     if (severity := _severity(1 / low, told)) is not None:
-        if _alike(told.S, spread) and told.R.any():
+        if _alike(told.S, spread, told) and told.R.any():
             return (
                 severity, "S", "S is H·P·Hᵀ alone: the noise R of the reading is missing from it, so that the gain "
                 "follows every reading", "write S = H·P·Hᵀ + R",
@@ -134,7 +143,7 @@ def _spread(told: Told, points: bool) -> _Line | None:
 def _gain(told: Told) -> _Line | None:
     """K·S = C. Large is a gain that leaves GROSS times the least variance in some direction."""
     size = np.linalg.norm(told.C, axis=(1, 2))
-    if np.median(np.linalg.norm(told.K @ told.S + told.C, axis=(1, 2)) / np.maximum(size, 1e-300)) < _ALIKE:
+    if np.median(np.linalg.norm(told.K @ told.S + told.C, axis=(1, 2)) / np.maximum(size, 1e-300)) < told.near:
         return (
             "error", "gain", "the gain has the wrong sign, −P·Hᵀ·S⁻¹: every update moves the mean away from its "
             "reading", "write K = P·Hᵀ·S⁻¹, and add K·ν to the mean",
@@ -159,12 +168,12 @@ def _mean(told: Told) -> _Line | None:
     if not (size > 0).any():
         return None
     share = float(np.median(np.linalg.norm(told.moved, axis=1)[size > 0] / size[size > 0]))
-    if np.median(np.linalg.norm(told.moved + should, axis=1)[size > 0] / size[size > 0]) < _ALIKE:
+    if np.median(np.linalg.norm(told.moved + should, axis=1)[size > 0] / size[size > 0]) < told.near:
         return (
             "error", "mean", "the mean is moved by −K·ν: every update moves it away from its reading",
             "add K·ν to the mean, with ν = z − h(x)",
         )  # fmt: skip
-    if share < _ALIKE:
+    if share < told.near:
         return (
             "error", "mean", "the mean stays as it was before the update: K·ν is not added to it, or to a copy only",
             "add K·ν to the mean, and carry that mean on",
@@ -186,13 +195,13 @@ def _cov(told: Told) -> _Line | None:
     severity = _severity(np.maximum(high, 1 / np.maximum(low, 1e-300)), told)
     if severity is None:
         return None
-    if _alike(told.after, told.P):
+    if _alike(told.after, told.P, told):
         return (
             "error", "covariance", "the covariance after an update is the one before it: what a reading tells is not "
             "taken off, so that the gain stays too large and the filter never becomes surer",
             "write P⁺ = (I − K·H)·P, and carry that P on to the next prediction",
         )  # fmt: skip
-    if _alike(told.after, told.P + told.K @ np.swapaxes(told.C, 1, 2)):
+    if _alike(told.after, told.P + told.K @ np.swapaxes(told.C, 1, 2), told):
         return (
             "error", "covariance", "the covariance grows with every reading: P⁺ is (I + K·H)·P, with a wrong sign",
             "write P⁺ = (I − K·H)·P, better in Joseph's form",
@@ -218,29 +227,36 @@ def _noise(case: Case, step: np.ndarray) -> Array | None:
     return np.where(same[:, None, None], tables[0].values["noise"][at], np.nan)
 
 
-def _added(told: Told, Q: Array | None) -> _Line | None:
+def _added(told: Told, Q: Array | None, parts: list[slice]) -> _Line | None:
     """What is beyond P⁺ is the prediction's Q, to rounding; or the prediction has none, and something is added here."""
     left = _left(told)
     if Q is None or not sound(left).all():
         return None
     rows = np.isfinite(Q).all((1, 2))
-    beyond, size = told.after - left, np.abs(told.after).max((1, 2))
-    if rows.sum() < _FEWEST or np.median(np.abs(beyond[rows]).max((1, 2)) / size[rows]) < _ROUNDED:
+    beyond, rounding = told.after - left, _rounding(told)
+    if rows.sum() < _FEWEST or np.median(np.abs(beyond[rows]).max((1, 2)) / rounding[rows]) < 1:
         return None
-    low, high = _ratios(told.after, left)
+    _, high = _ratios(told.after, left)
     severity = _severity(high, told) or "warning"
-    if Q[rows].any() and _alike(beyond[rows], Q[rows]):
+    if Q[rows].any() and (times := _multiple(beyond[rows], Q[rows], parts, rounding[rows], told)) is not None:
+        of = "Q" if abs(times - 1) < told.near else f"{times:.3g}× Q"
         return (
-            severity, "covariance", "the covariance after an update is what its gain and S leave, and Q besides: the "
-            "process noise is added in the update as well as in the prediction", "add Q in the prediction alone",
+            severity, "covariance", f"the covariance after an update is what its gain and S leave, and {of} besides: "
+            "the process noise is added in the update as well as in the prediction", "add Q in the prediction alone",
         )  # fmt: skip
-    if not Q[rows].any() and float(np.median(low)) > 1 - _ROUNDED:
+    if not Q[rows].any() and np.median(np.linalg.eigvalsh(beyond[rows])[:, 0] / rounding[rows]) > -1:
         return (
             severity, "covariance", "the prediction adds no process noise, and the covariance after an update is "
             f"larger than its gain and S leave, up to {float(np.median(high)):.3g}×: Q is added in the update, so that "
             "it counts once a reading and not by time", "add Q in the prediction, and not in the update",
         )  # fmt: skip
     return None
+
+
+def _rounding(told: Told) -> Array:
+    """What rounding leaves of the covariance after an update (M,): its terms are products of d × d matrices as large as
+    the covariance before it (`covariance.broken`), some eight of them."""
+    return 8 * told.P.shape[-1] * epsilon(told.after) * np.abs(told.P).max((1, 2))
 
 
 def _left(told: Told) -> Array:
@@ -260,10 +276,23 @@ def _ratios(A: Array, B: Array) -> tuple[Array, Array]:
 def _severity(ratio: Array, told: Told) -> Severity | None:
     """ratio (M,), at least 1 where the lines agree. In the middle, for a few odd updates are another matter."""
     middle = float(np.median(np.where(ratio > 0, ratio, np.inf)))
-    if not middle > 1 + np.sqrt(2 / (len(told.step) * told.S.shape[-1])):
+    if not middle > 1 + told.told:
         return None
     return "error" if middle > GROSS else "warning"
 
 
-def _alike(A: Array, B: Array) -> bool:
-    return bool(np.median(np.abs(A - B).max((1, 2)) / np.maximum(np.abs(B).max((1, 2)), 1e-300)) < _ALIKE)
+def _multiple(A: Array, B: Array, parts: list[slice], rounding: Array, told: Told) -> float | None:
+    """The factor c by which A is c·B but for a turn of each part of the state, such as that of the body's axes, by the
+    eigenvalues of its block; None where it is not. Of one eigenvalue any c would do: then it must be 1."""
+    a, b = (np.concatenate([np.linalg.eigvalsh(symmetrised(M[:, k, k])) for k in parts], axis=1) for M in (A, B))
+    there = np.median(np.maximum(a, b) / rounding[:, None], axis=0) > 1
+    ratio = np.median(a[:, there] / np.maximum(b[:, there], 1e-300), axis=0)
+    c = float(np.median(ratio)) if len(ratio) else 0.0
+    if c <= 0 or np.abs(ratio / c - 1).max() > told.near:
+        return None
+    return c if len(ratio) > 1 or abs(c - 1) < told.near else None
+
+
+def _alike(A: Array, B: Array, told: Told) -> bool:
+    off = np.abs(A - B).max((1, 2)) / np.maximum(np.abs(B).max((1, 2)), 1e-300)
+    return bool(np.median(off) < told.near)

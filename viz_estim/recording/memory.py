@@ -12,9 +12,10 @@ import numpy as np
 from viz_estim.core.descriptions import describe, rebuild
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario, Step
+from viz_estim.core.scenery import Cloud
 from viz_estim.core.spaces import Space
 from viz_estim.core.stages import Innovation, Matches, SigmaPoints, Stage
-from viz_estim.recording.layout import as_product
+from viz_estim.recording.layout import as_product, flat3
 from viz_estim.recording.reader import Run
 from viz_estim.recording.tables import StageTable, ends, work_out
 
@@ -57,6 +58,11 @@ def collect(scenario: Scenario, steps: Iterable[Step], params: dict[str, Any] | 
         ends(index, tables, space, labels),
         f"step {failure.step}, stage {failure.stage}: {failure.message}" if failure else None,
         True,
+        {
+            name: (flat3(thing.points), thing.moves)
+            for name, thing in scenario.scenery.items()
+            if isinstance(thing, Cloud)
+        },
     )
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,8 @@ from viz_estim.recording.layout import as_product
 from viz_estim.recording.rescue import last_whole, whole
 from viz_estim.recording.tables import Gathered, StageTable, ends, fill_in, table_of, work_out
 
+_CLOUDS = (f"{schema.WORLD}/scenery/", f"{schema.WORLD}/moved/")  # of the scene: those that stand, and those that move
+
 
 class NotARun(BadInput):
     """A sound recording, but not of a run: a calibration's picture, or another program's."""
@@ -36,7 +38,8 @@ class Run:
     inputs: `control`, `z.<sensor>` and `raw.<sensor>` by name (N, …). ends: the belief at the end of each step, by the
     name of its arrays: mean (N, n) and cov (N, d, d), or log_probabilities (N, K) of `labels`, whose truth (N, 1) is
     the label's index; the space then has no parts. properties: scenario, params, seed, data, versions, …; complete:
-    the run ended well.
+    the run ended well. clouds: points (N, 3) in m of the scene's clouds by name, z = 0 in a plane, and whether the
+    estimate moves them.
     """
 
     path: Path
@@ -52,6 +55,7 @@ class Run:
     ends: dict[str, Array]
     error: str | None
     complete: bool
+    clouds: dict[str, tuple[Array, bool]] = field(default_factory=dict)
 
     @property
     def mean(self) -> Array:
@@ -134,7 +138,8 @@ def load(path: str | Path, *, points: bool | None = True) -> Run:
     steps = Gathered()
     stages: dict[str, Gathered] = {}
     error = None
-    for chunk in _chunks(path):
+    clouds: dict[str, tuple[Array, bool]] = {}
+    for chunk in _chunks(path, _CLOUDS if points else ()):
         entity = str(chunk.entity_path)
         if entity == "/__properties/viz_estim":
             properties |= _texts(chunk.to_record_batch())
@@ -145,6 +150,8 @@ def load(path: str | Path, *, points: bool | None = True) -> Run:
         elif entity.startswith("/stages/"):
             keep = "particles" in properties if points is None else points  # properties come first
             stages.setdefault(entity, Gathered(keep)).add(chunk.to_record_batch())
+        elif (drawn := _points(chunk.to_record_batch())) is not None:
+            clouds[entity.rpartition("/")[2]] = drawn, entity.startswith(_CLOUDS[1])
     if properties.keys() & {"space", "labels"} and not (steps.times and (stages or "result" in properties)):
         raise NotARun(f"{path}: the run was cut off before its first steps were written")
     if not properties.keys() & {"space", "labels"}:
@@ -170,7 +177,7 @@ def load(path: str | Path, *, points: bool | None = True) -> Run:
         work_out(tables, space)
     found = Run(
         path, facts, space, labels, index["step"], index["time"], steps.column("dt", ()), truth, inputs, tables,
-        ends(index["step"], tables, space, labels), error, "result" in facts,
+        ends(index["step"], tables, space, labels), error, "result" in facts, clouds,
     )  # fmt: skip
     if found.complete or error:
         return found
@@ -195,13 +202,13 @@ def _until(run: Run, last: int) -> Run:
     )  # fmt: skip
 
 
-def _chunks(path: Path) -> Iterator[Any]:
+def _chunks(path: Path, also: Iterable[str]) -> Iterator[Any]:
     if path.is_dir():
         raise BadInput(f"{path}: is a folder, expected a recording")
     if not path.is_file():
         raise BadInput(f"{path}: no such recording")
     try:
-        content = ["/__properties/**", "/steps", "/events", "/stages/**"]
+        content = ["/__properties/**", "/steps", "/events", "/stages/**", *(f"{above}*" for above in also)]
         with whole(path) as sound:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", RerunWarning)  # a killed run has no footer: we say so ourselves
@@ -210,6 +217,13 @@ def _chunks(path: Path) -> Iterator[Any]:
     except (ValueError, OSError, RuntimeError) as error:
         text = " ".join(str(error).split())
         raise BadInput(f"{path}: not a readable recording, or damaged ({text[:120]})") from error
+
+
+def _points(batch: pa.RecordBatch) -> Array | None:
+    """The points (N, 3) of a cloud that stands still in its frame."""
+    name = "Points3D:positions"
+    rows = batch.column(name).to_pylist() if name in batch.schema.names else []
+    return np.array(rows[0], float).reshape(-1, 3) if len(rows) == 1 and rows[0] else None
 
 
 def _texts(batch: pa.RecordBatch) -> dict[str, str]:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from viz_estim.core import quaternions
+from viz_estim.core.distributions import norm
 from viz_estim.core.quaternions import Array
 
 _BASELINE = 0.5  # s: the shortest prefix that counts as lying still
@@ -18,6 +19,8 @@ _LEVEL = (0.25, 1.0)  # rad/s, m/s²: how far from 0 and from gravity a still se
 _SHORTEST_FREEZE = 0.3  # s
 _UNEXPLAINED = (0.1, 0.5)  # rad: gravity's turn that the gyro must have missed; off its rest level, and on it
 _BIAS_LEFT = 0.005  # rad/s: what may be left of the gyro's bias, and adds up to a turn
+
+_RATE = 1e-4  # of a run in which noise alone passes for motion, over all its samples and channels
 
 GRAVITY = 9.81  # m/s²
 
@@ -64,7 +67,8 @@ def _still(stamps: Array, gyro: Array, accel: Array) -> int:
         at_rest = GRAVITY if values is accel else 0.0
         if scatter.max() > steady or abs(float(np.linalg.norm(base)) - at_rest) > level:
             return 0
-        bound = np.maximum(floor, 6.0 * scatter / np.sqrt(width))
+        # White noise: of T means over the window, three channels each of two sensors, on both sides.
+        bound = np.maximum(floor, norm.isf(_RATE / (12 * len(stamps))) * scatter * np.sqrt(1 / width + 1 / n))
         moved = (np.abs(uniform_filter1d(values, width, axis=0, mode="nearest") - base) > bound).any(1)
         if moved.any():
             end = min(end, int(np.argmax(moved)) - width // 2)
@@ -123,7 +127,7 @@ def frozen_accel(stamps: Array, gyro: Array, accel: Array) -> np.ndarray:
         carried = np.linalg.norm(np.cumsum(steps, axis=0), axis=1).max(initial=0.0)
         noise = np.diff(gyro[first:end], axis=0).std(0).max() / np.sqrt(2)
         walk = noise * (stamps[end - 1] - stamps[first]) / np.sqrt(end - first)  # what noise alone adds up to, 1σ
-        if carried > _UNEXPLAINED[0] + 5 * walk:
+        if carried > _UNEXPLAINED[0] + norm.isf(_RATE / (4 * len(stamps))) * walk:  # the most of a walk: twice its end
             frozen[first:end] = True
     return frozen
 
