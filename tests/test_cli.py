@@ -151,7 +151,7 @@ def test_the_commands_that_are_printed_can_be_pasted(cli: Cli, short: list[str],
 
 
 def test_simulated_files_calibrate_and_run(cli: Cli, tmp_path: Path) -> None:
-    folder, options = tmp_path / "sim", ["--set=duration=16", "--set=still=3", "--set=freeze=0", "--seed", "2"]
+    folder, options = tmp_path / "sim", ["--set=duration=11", "--set=still=3", "--set=freeze=0", "--seed", "2"]
     done = cli("simulate", "imu", *options, "--out", folder)
     assert (done.code, done.err) == (0, "")
     files = [Path(line) for line in done.out.splitlines()]

@@ -111,8 +111,8 @@ def diagnose(run: Run) -> list[Finding]:
             found += motion.prediction(under_test)  # else the filter knows how wrong it is
         # Noises are tuned once nothing else is wrong: until then a factor on them would only hide it.
         causes = [f for f in ranked(found) if f.severity == "error" and f.tier <= _TIMES and f.code != "start"]
-        tuned = replace(under_test, tune=not causes)
-        found += confidence.by_sensor(tuned)
+        # The case itself where it can be, for it keeps what was tuned before.
+        found += confidence.by_sensor(replace(under_test, tune=False) if causes else under_test)
     return sorted(_once(ranked(found)), key=lambda finding: finding.order)
 
 
