@@ -1,6 +1,7 @@
 """Errors, NEES, NIS and bands against their formulas; and the filters are consistent on data of their own model."""
 
 import inspect
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -13,9 +14,9 @@ from viz_estim.core import consistency, quaternions
 from viz_estim.core.beliefs import Gaussian, normal
 from viz_estim.core.consistency import Tally, band, metrics, nees, nees_summary, nis, rms, squared_distance
 from viz_estim.core.quaternions import Array
-from viz_estim.core.run import Scenario, StandIn, Tick, run
+from viz_estim.core.run import Scenario, StandIn, Step, Tick, run
 from viz_estim.core.spaces import S2, SE2, SO3, Euclidean, Product
-from viz_estim.core.stages import UnscentedUpdate
+from viz_estim.core.stages import Innovation, UnscentedUpdate, Update
 from viz_estim.core.unscented import UnscentedFilter
 from viz_estim.scenarios import imu
 
@@ -29,6 +30,36 @@ def test_squared_distance_and_rms_are_their_formulas() -> None:
     for i in np.ndindex(3, 5):
         assert squared_distance(e, P)[i] == pytest.approx(e[i] @ np.linalg.inv(P[i]) @ e[i])
     assert rms(np.array([[3.0, 4.0], [0.0, 0.0]])) == pytest.approx(np.sqrt(25 / 2))
+
+
+def test_a_tally_keeps_the_numbers_of_a_long_run_and_nothing_else() -> None:
+    """A step's records take some ten times the room of the numbers that its summary is made of."""
+    rng, steps = np.random.default_rng(3), 2500
+    space, reading = Product(state=Euclidean(("a", "b"))), Product(z=Euclidean(("z",)))
+    means, truths, residuals = (
+        rng.standard_normal((steps, 2)),
+        rng.standard_normal((steps, 2)),
+        rng.standard_normal(steps),
+    )
+    covs = rng.uniform(1, 2, (steps, 2))[..., None] * np.eye(2)
+    tally = Tally(space)
+    tracemalloc.start()
+    for k in range(steps):
+        one = np.full((1, 1), 2.0 + k % 3)
+        told = Innovation(
+            reading, residuals[k, None], np.zeros(1), residuals[k, None], one, one.copy(), np.zeros((2, 1)),
+            np.ones(1, bool), np.ones(1, bool), np.zeros((2, 1)),
+        )  # fmt: skip
+        belief = Gaussian(space, means[k].copy(), covs[k].copy())
+        tally.add(Step(k, Tick(0.1 * k, 0.1), (Update("update", belief, told, np.zeros((2, 1))),), truths[k].copy()))
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    numbers = 8 * (2 + 4 + 2 + 1 + 1) + 1
+    assert held < 1.3 * steps * numbers + 1000 * 10 * 112  # but for the last thousand, in arrays of their own
+    found = tally.summary()
+    error = means - truths
+    assert found["nees"]["mean"] == pytest.approx((error**2 / covs[:, [0, 1], [0, 1]]).sum(1).mean())
+    assert found["nis"]["z"]["mean"] == pytest.approx((residuals**2 / (2.0 + np.arange(steps) % 3)).mean())
 
 
 def test_the_band_holds_the_mean_of_as_many_draws_as_it_says() -> None:

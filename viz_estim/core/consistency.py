@@ -205,6 +205,25 @@ def _pooled(found: list[dict[str, Nis]]) -> dict[str, Nis]:
     return {name: Nis(np.concatenate([n.values for n in all_]), all_[0].dof) for name, all_ in pooled.items()}
 
 
+class _Rows:
+    """Arrays of one shape, one after the other, kept a thousand to an array: a small one's head is larger than its
+    numbers, and a robot runs for hours."""
+
+    def __init__(self) -> None:
+        self._new: list[Any] = []
+        self._blocks: list[Array] = []
+
+    def append(self, row: Any) -> None:
+        self._new.append(row)
+        if len(self._new) == 1000:
+            self._blocks.append(np.stack(self._new))
+            self._new = []
+
+    def stacked(self) -> Array:
+        """All of them (N, …), of which there is at least one."""
+        return np.concatenate([*self._blocks, np.stack(self._new)] if self._new else self._blocks)
+
+
 class Tally:
     """Gathers of each step what a run's summary needs, and nothing large: clouds and sigma points are let go.
 
@@ -213,9 +232,8 @@ class Tally:
 
     def __init__(self, space: Space | None, first: int = 0, facts: Mapping[str, float] | None = None) -> None:
         self.space, self.first, self.facts = space, first, facts or {}
-        self.ends: dict[str, list[Array]] = {}
-        self.truths: list[Array] = []
-        self.innovations: dict[str, list[Any]] = {}
+        self.ends: dict[str, _Rows] = {}
+        self.innovations: dict[str, tuple[Any, dict[str, _Rows]]] = {}  # by stage: the reading's space, and its numbers
 
     def add(self, step: Any) -> None:
         """Takes in a `Step`, unless it lies before the first that counts or never came to its end."""
@@ -223,22 +241,28 @@ class Tally:
             return
         belief = step.stages[-1].belief
         if all(hasattr(step.stages[-1], name) for name in FIT):
-            self.ends, self.truths = {}, []
-        names = ("log_probabilities",) if self.space is None else ("mean", "cov")
-        for name in names:
-            self.ends.setdefault(name, []).append(getattr(belief, name))
+            self.ends = {}
         size = 1 if self.space is None else len(self.space.names)
-        self.truths.append(np.full(size, np.nan) if step.truth is None else step.truth)
+        ended = {"truth": np.full(size, np.nan) if step.truth is None else step.truth}
+        for name in ("log_probabilities",) if self.space is None else ("mean", "cov"):
+            ended[name] = getattr(belief, name)
+        for name, value in ended.items():
+            self.ends.setdefault(name, _Rows()).append(value)
         for stage in step.stages:
             if hasattr(stage, "innovation"):
-                self.innovations.setdefault(stage.name, []).append(stage.innovation)
+                told = stage.innovation
+                _, rows = self.innovations.setdefault(stage.name, (told.space, {k: _Rows() for k in _TOLD}))
+                for name, column in rows.items():
+                    column.append(getattr(told, name))
 
     def summary(self) -> dict[str, Any]:
         """The run's `summary`."""
         innovations: list[Any] = [
-            (rows[0].space, *(np.stack([getattr(row, k) for row in rows]) for k in ("residual", "cov", "offered")))
-            for rows in self.innovations.values()
+            (space, *(rows[name].stacked() for name in _TOLD)) for space, rows in self.innovations.values()
         ]
-        ends = {name: np.stack(rows) for name, rows in self.ends.items()}
-        truth = np.stack(self.truths) if self.truths else np.empty(0)
+        ends = {name: rows.stacked() for name, rows in self.ends.items()}
+        truth = ends.pop("truth", np.empty(0))
         return summary(self.space, ends, truth, innovations, self.facts)
+
+
+_TOLD = ("residual", "cov", "offered")
