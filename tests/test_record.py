@@ -39,7 +39,9 @@ def readings(count: int = 60, seed: int = 0) -> tuple[Array, Array]:
     return truth, truth[:, :1] + 0.5 * rng.standard_normal((count, 1))
 
 
-def own_loop(path: Path, *, every: int = 1, fails: int | None = None) -> tuple[list[Array], list[Array]]:
+def own_loop(
+    path: Path, *, every: int = 1, fails: int | None = None, start: float = 0.0
+) -> tuple[list[Array], list[Array]]:
     """A Kalman filter as a person writes it, in place; returns the beliefs at the end of each step."""
     truth, z = readings()
     x, P = np.zeros((2, 1)), np.eye(2)
@@ -58,7 +60,7 @@ def own_loop(path: Path, *, every: int = 1, fails: int | None = None) -> tuple[l
                 x += K @ y[:, None]
                 P -= K @ S @ K.T
                 rec.stage("update", mean=x, cov=P, residual=y, residual_cov=S, gain=K, sensor="gps", z=z[k], noise=0.25)
-            rec.step(time=0.1 * k, truth=truth[k])
+            rec.step(time=start + 0.1 * k, truth=truth[k])
             means.append(x[:, 0].copy())
             covs.append(P.copy())
     return means, covs
@@ -103,6 +105,15 @@ def test_it_opens_shows_compares_and_debugs_like_any_other(
     assert "error: a.rrd: recorded by viz_estim.record: there is no scenario" in done.out
     forked = cli("fork", "a.rrd", "--at", 3, "--set", "q=1")
     assert (forked.code, forked.err.count("\n")) == (2, 1)
+
+
+def test_runs_by_other_clocks_are_said_to_be_so(cli: Cli, tmp_path: Path) -> None:
+    own_loop(tmp_path / "a.rrd")
+    own_loop(tmp_path / "b.rrd", start=1.7e9)
+    done = cli("compare", tmp_path / "a.rrd", tmp_path / "b.rrd", "--json")
+    assert done.code == 1
+    reason = json.loads(done.out)["reason"]
+    assert "from 1700000000 to 1700000005.9 s, the first from 0 to 5.9 s" in reason
 
 
 def cloud(path: Path) -> Array:

@@ -34,7 +34,10 @@ def other_data(a: Run, b: Run) -> str | None:
     if not all("recorded_by" in run.properties for run in (a, b)) and (why := _other_source(a, b)):
         return why
     if not len(paired(a.time, b.time)[0]):
-        return "no step of it has a stamp of the first run's"
+        return (
+            f"no step of it has a stamp of the first run's: it goes from {b.span}, the first from {a.span}; "
+            "tell both runs the same stamps"
+        )
     if a.labels != b.labels or not (a.labels or shared_parts(as_product(a.space), as_product(b.space))):
         return "its state has no part in common with the first run's"
     return None

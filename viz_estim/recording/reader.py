@@ -83,6 +83,12 @@ class Run:
                 return other, found
         return None
 
+    @property
+    def span(self) -> str:
+        """From when to when it goes, in words and in full: the stamps of a clock too."""
+        first, last = (f"{stamp:.6f}".rstrip("0").rstrip(".") for stamp in self.time[[0, -1]])
+        return f"{first} to {last} s"
+
     def row(self, *, step: int | None = None, time: float | None = None) -> int:
         """The row of a step by its number, or of the last one at or before a time (s). BadInput where there is none."""
         if step is not None:
@@ -93,10 +99,7 @@ class Run:
         assert time is not None
         row = int(np.searchsorted(self.time, time + 5e-10, side="right")) - 1  # stamps are kept to the nanosecond
         if row < 0 or not time <= self.time[-1] + 1.0:
-            first, last = (
-                f"{stamp:.6f}".rstrip("0").rstrip(".") for stamp in self.time[[0, -1]]
-            )  # those of a clock too
-            raise BadInput(f"{self.path}: no step at {time:.16g} s; it holds {first} to {last} s")
+            raise BadInput(f"{self.path}: no step at {time:.16g} s; it holds {self.span}")
         return row
 
     def place(self, place: int) -> int:
