@@ -8,6 +8,7 @@ import os
 import re
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,11 @@ from viz_estim.recording.standing import Standing
 # lose a second of them, or while a viewer watches.
 _ROWS = (700, 2500)  # at least, for each batch has its cost; and at most
 _BYTES = (2 << 20, 20 << 20)  # about, above the least rows; and in no case more
+# Steps as large as these take their time in calls that free the interpreter's lock (a tree is asked for ten thousand
+# neighbours, a hundred thousand particles move): the other thread writes meanwhile, in batches that are soon full. By
+# small steps it would be hindered, and hinder them.
+_LARGE, _BYTES_BESIDE = 256 << 10, 5 << 20
+_BEHIND = 3  # full batches that may wait for it
 _SECONDS = 0.8
 _SECONDS_WATCHED = 0.05
 
@@ -61,12 +67,14 @@ class Recorder:
         self._layout = Layout(scenario)
         self._last: Stage | None = None  # of the steps sent so far
         self._rows: list[Step] = []
+        self._full: deque[list[Step]] = deque()  # batches that wait to be written
+        self._beside = False  # whether the other thread writes them
         self._limit = _ROWS[1]  # steps to a batch; the first few tell the size of the others
         self._sized = 0
         self._viewed: list[str] | None = None  # what the view shows, and about how much of the world
         self._framed = 0.0
         self._places = 0  # taken on the stage timeline
-        self._lock = threading.Lock()
+        self._lock, self._writing = threading.Lock(), threading.Lock()  # of the batches, and of the file
         self._failed: Exception | None = None
         self._closed = threading.Event()
         self._sent = threading.Event()  # a batch waits to be written
@@ -111,13 +119,23 @@ class Recorder:
                 self._oldest = now
             self._rows.append(step)
             if self._sized < 3:
-                self._sized += 1
-                few, most = (limit // max(1, _size(step)) for limit in _BYTES)
-                self._limit = max(1, min(self._limit, max(few, _ROWS[0]), most))
+                self._size_batches(max(1, _size(step)))
             # By time here rather than by the timer, where steps are quick enough: two threads would hinder each other.
-            if len(self._rows) >= self._limit or now - self._oldest >= 0.9 * self._patience:
-                self._flush()
-                self._sent.set()
+            full = len(self._rows) >= self._limit or now - self._oldest >= 0.9 * self._patience
+            if full:
+                self._take()
+        if full:
+            if not self._beside or len(self._full) > _BEHIND:
+                self._write()
+            self._sent.set()
+
+    def _size_batches(self, size: int) -> None:
+        """Settles, from a step of so many bytes, how many make a batch, and who writes it."""
+        self._sized += 1
+        self._beside |= size >= _LARGE
+        few, most = (limit // size for limit in _BYTES)
+        rows = _BYTES_BESIDE // size if self._beside else min(max(few, _ROWS[0]), most)
+        self._limit = max(1, min(self._limit, rows))
 
     def close(self, result: dict[str, Any] | None = None, *, facts: Mapping[str, float] | None = None) -> None:
         """Ends the recording well: the result is kept with it, and the file takes its own name.
@@ -150,8 +168,8 @@ class Recorder:
         self._closed.set()
         self._sent.set()
         self._timer.join()
-        with self._lock:
-            self._flush()
+        self._take()
+        self._write()
 
     def _disconnect(self) -> None:
         self._stream.flush()
@@ -167,9 +185,10 @@ class Recorder:
                 with self._lock:
                     age = time.monotonic() - self._oldest if self._rows else 0.0
                     if age >= self._patience:
-                        self._flush()
+                        self._take()
                         age = 0.0
-                    places = self._places
+                self._write()
+                places = self._places
                 if places != written:  # to the file, for a kill may come; steps go on meanwhile
                     self._stream.flush()
                     written = places
@@ -182,11 +201,20 @@ class Recorder:
         texts = {name: json.dumps(value) for name, value in (self._properties | self._layout.as_json()).items()}
         send_static(self._stream, "/__properties/viz_estim", rr.AnyValues(drop_untyped_nones=False, **texts))
 
-    def _flush(self) -> None:
-        """Sends what is buffered: the steps, their stages by name, and what is drawn of them."""
-        steps, self._rows = self._rows, []
-        if not steps:
-            return
+    def _take(self) -> None:
+        """Makes a batch of the steps that came."""
+        if self._rows:
+            self._full.append(self._rows)
+            self._rows = []
+
+    def _write(self) -> None:
+        """Sends the batches that wait, in order."""
+        with self._writing:
+            while self._full:
+                self._flush(self._full.popleft())
+
+    def _flush(self, steps: list[Step]) -> None:
+        """Sends a batch: the steps, their stages by name, and what is drawn of them."""
         batch = Batch(steps, self._places, self._last)
         self._places, self._last = batch.end, batch.last
         if self._layout.learn(batch):  # before the columns that it describes: the file may be cut between them
