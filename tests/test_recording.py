@@ -1,6 +1,8 @@
 """What an estimator did comes back from its recording, bit for bit; what is drawn stands as long as its stage does."""
 
 import dataclasses
+import threading
+import time
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -201,6 +203,51 @@ def test_every_number_comes_back_bit_for_bit(recorded: tuple[Path, list[Step]]) 
     ticks = [step.tick for step in steps]
     given = {f"z.{s}" for tick in ticks for s in tick.measurements} | {f"raw.{s}" for tick in ticks for s in tick.raw}
     assert set(loaded.inputs) - {"control"} == given
+
+
+def large_steps(count: int) -> Scenario:
+    """A walk by a filter of one's own whose steps are as large as a scan's matches."""
+    rng, space = np.random.default_rng(0), Product(place=Euclidean(("x", "y"), "m"))
+    tables = rng.standard_normal((count, 40, 1000))
+
+    class Walk:
+        pure = True
+
+        def step(self, belief: Gaussian, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:
+            time.sleep(0.002)  # as in a call that frees the interpreter's lock
+            table = tables[round(tick.time)]
+            yield Learn("learn", Gaussian(space, belief.mean + table[0, :2], belief.cov), table[:1], table)
+
+    ticks = [Tick(float(k), float(k > 0)) for k in range(count)]
+    return Scenario(Walk(), {0: Gaussian(space, np.zeros(2), np.eye(2))}, ticks)
+
+
+def test_large_steps_come_back_bit_for_bit_though_another_thread_writes_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writers = set()
+    flush = Recorder._flush
+
+    def seen(self: Recorder, steps: list[Step]) -> None:
+        writers.add(threading.current_thread())
+        flush(self, steps)
+
+    monkeypatch.setattr(Recorder, "_flush", seen)
+    steps = record(tmp_path / "a.rrd", large_steps(60))
+    assert_holds(viz_estim.load(tmp_path / "a.rrd"), steps)
+    assert writers - {threading.main_thread()}
+
+
+def test_a_failure_to_write_reaches_the_filter_from_another_thread_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: Recorder, steps: list[Step]) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Recorder, "_flush", full)
+    with pytest.raises(OSError, match="No space left"):
+        record(tmp_path / "a.rrd", large_steps(60))
+    assert not (tmp_path / "a.rrd").exists()
 
 
 def test_every_thins_sigma_points_and_no_numbers(tmp_path: Path) -> None:
