@@ -355,6 +355,21 @@ def test_a_group_s_state_has_more_numbers_than_directions(tmp_path: Path) -> Non
     assert viz_estim.load(tmp_path / "a.rrd").summary()["metrics"]["attitude_rmse_deg"] == 0.0
 
 
+def test_a_recording_that_was_closed_is_not_begun_anew(tmp_path: Path) -> None:
+    """As in a notebook, where the loop's cell is run again without the one that began the recording."""
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        for k in range(5):
+            rec.stage("predict", mean=[0.0], cov=[[1.0]])
+            rec.step(time=k)
+    kept = (tmp_path / "a.rrd").read_bytes()
+    with pytest.raises(ValueError, match="is closed"):
+        rec.stage("predict", mean=[0.0], cov=[[1.0]])
+    with pytest.raises(ValueError, match="is closed"):
+        rec.step(time=9)
+    rec.close()
+    assert (tmp_path / "a.rrd").read_bytes() == kept
+
+
 def test_without_names_components_are_counted(tmp_path: Path) -> None:
     with viz_estim.record(tmp_path / "a.rrd") as rec:
         rec.stage("update", mean=3.0, cov=1.0, residual=0.5, residual_cov=2.0, gain=0.3)
