@@ -67,7 +67,8 @@ BAD_DATA = {
     "a column too few": (text("bad.csv", HEADER.replace(",accel_z", "") + ROWS), "bad.csv"),
     "a column missing": (text("bad.csv", HEADER.replace("accel_z", "other") + ROWS), "accel_z"),
     "header alone": (text("bad.csv", HEADER), "bad.csv"),
-    "foreign suffix": (text("bad.txt", "hello"), "bad.txt"),
+    "foreign suffix": (text("bad.dat", "hello"), "bad.dat"),
+    "a text without numbers": (text("bad.txt", "hello"), "bad.txt"),
 }
 
 # Files that stand there before, a command ({} is their folder), and a word of the line that it gives.

@@ -126,6 +126,27 @@ def test_export_holds_what_was_recorded(cli: Cli, recording: Path, tmp_path: Pat
                 np.testing.assert_array_equal(arrays[f"stages/{table.name}/{name}"], values)
 
 
+def test_matches_of_another_number_each_time_are_exported_as_plain_numbers(cli: Cli, tmp_path: Path) -> None:
+    assert cli("run", "scan-icp", "--out", tmp_path / "a.rrd").code == 0
+    assert cli("export", tmp_path / "a.rrd", "--to", "npz", "-o", tmp_path / "a.npz").code == 0
+    matches = viz_estim.load(tmp_path / "a.rrd").stages["match"].values
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as arrays:
+        held = dict(arrays)
+    for name in ("matches.source", "matches.source_index"):
+        count = held[f"stages/match/{name}.count"]
+        parts = np.split(held[f"stages/match/{name}"], np.cumsum(count)[:-1])
+        assert len(set(count)) > 1
+        for part, row in zip(parts, matches[name], strict=True):
+            np.testing.assert_array_equal(part, row)
+
+
+def test_labels_are_exported_beside_their_probabilities(cli: Cli, tmp_path: Path) -> None:
+    assert cli("run", "underwater-bayes", "--out", tmp_path / "a.rrd").code == 0
+    assert cli("export", tmp_path / "a.rrd", "--to", "npz", "-o", tmp_path / "a.npz").code == 0
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as arrays:
+        assert tuple(arrays["labels"]) == viz_estim.load(tmp_path / "a.rrd").labels
+
+
 def test_a_trajectory_has_the_heading_of_a_planar_robot(cli: Cli, tmp_path: Path) -> None:
     assert cli("run", "diffdrive-ekf", "--seed", 2, "--set", "data.duration=2", "--out", tmp_path / "a.rrd").code == 0
     assert cli("export", tmp_path / "a.rrd", "--to", "tum", "-o", tmp_path / "a.tum").code == 0

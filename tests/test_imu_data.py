@@ -87,7 +87,7 @@ def write(path: Path, columns: dict[str, Any], pack: bool = True) -> Path:
     return path
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+@pytest.mark.parametrize("suffix", [".csv", ".txt", ".npz"])
 @pytest.mark.parametrize("truth", [False, True])
 def test_a_plain_log_is_read_in_si_units_with_and_without_truth(tmp_path: Path, suffix: str, truth: bool) -> None:
     columns = table(np.random.default_rng(2), truth)

@@ -170,6 +170,8 @@ def wrong():
     result = strict(cli("run", f"{tmp_path / 'my.py'}:wrong", "--out", out, "--json"))
     run = viz_estim.load(out)
     assert len(run.step) == result["steps"]
+    texts = cli("show", out), cli("show", out, "--step", result["steps"] - 1), cli("diagnose", out)
+    assert not any(line.startswith("two") for text in texts for line in text.out.split("\n"))
     if what != "a singular S":
         assert result["error"]["step"] == 11
     strict(cli("show", out, "--step", result["steps"] - 1, "--json"))

@@ -223,6 +223,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "no reading": (lambda f: {**f, "TD": f["TD"][:0]}, "`TD`"),
     "text": (lambda f: {**f, "TD": "hello"}, "`TD` must hold numbers"),
     "a beacon twice": (lambda f: {**f, "TL": f["TL"][[0, 1, 1]]}, "beacon 1 twice"),
+    "ranges of another clock": (lambda f: {**f, "TD": f["TD"] + [[1e5, 0, 0, 0]]}, "no range came while there was"),
     "other beacons": (lambda f: {**f, "TL": f["TL"] + [[50, 0, 0]]}, "no reading is of a beacon"),
 }
 

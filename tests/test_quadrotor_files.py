@@ -150,6 +150,40 @@ def test_a_flight_that_is_first_seen_later_starts_there(tmp_path: Path) -> None:
     assert [len(step.tick.measurements) for step in run(scenario)][:14] == [0] * 12 + [1, 0]
 
 
+def test_a_struct_of_arrays_is_read_as_a_struct_array_is(tmp_path: Path) -> None:
+    fields = flight()
+    t, omg, acc = (np.stack([np.ravel(value) for value in fields["data"][name][0]]) for name in ("t", "omg", "acc"))
+    whole = read(write(tmp_path / "a.mat", fields))
+    for name, packed in {
+        "columns": {"t": t, "omg": omg, "acc": acc},
+        "rows": {"t": t.T, "omg": omg.T, "acc": acc.T},
+    }.items():
+        data = read(write(tmp_path / f"{name}.mat", fields | {"data": packed}))
+        for part in ("time", "gyro", "accel", "pose", "truth"):
+            np.testing.assert_array_equal(getattr(data, part), getattr(whole, part))
+
+
+@pytest.mark.parametrize("change", ["9×N", "6×N", "no rates", "no velocity"])
+def test_motion_capture_without_velocities_still_has_poses(change: str, tmp_path: Path) -> None:
+    fields = flight()
+    whole = read(write(tmp_path / "a.mat", fields))
+    vicon = fields["vicon"].copy()
+    vicon[6 if change == "no velocity" else 9 :] = np.nan
+    fields["vicon"] = vicon[: {"9×N": 9, "6×N": 6}.get(change, 12)]
+    data = read(write(tmp_path / "b.mat", fields))
+    np.testing.assert_array_equal(data.pose, whole.pose)
+    known = 7 if change in ("6×N", "no velocity") else 10
+    np.testing.assert_array_equal(data.truth[:, :known], whole.truth[:, :known])
+    assert np.isnan(data.truth[:, known:]).all()
+
+
+def test_poses_too_far_apart_are_not_taken_for_another_clock(cli: Cli, tmp_path: Path) -> None:
+    fields = flight()
+    sparse = write(tmp_path / "a.mat", fields | {name: fields[name][:, ::15] for name in ("vicon", "time")})
+    done = cli("run", "quadrotor-ukf-pose", "--data", sparse, "--out", tmp_path / "x.rrd")
+    assert (done.code, done.err.count("\n"), "0.15 s apart" in done.err) == (2, 1, True)
+
+
 def spoilt(values: Array, value: float = np.nan) -> Array:
     return np.where(np.arange(values.size).reshape(values.shape) == 7, value, values)
 
@@ -181,7 +215,7 @@ FIELDS: dict[str, dict[str, dict[str, Any]]] = {  # by kind of file: what stands
     "flight": {
         "no data": {"data": None}, "no vicon": {"vicon": None}, "no time": {"time": None},
         "numbers": {"data": C["time"]}, "no omg": {"data": without("omg")}, "no acc, t": {"data": without("acc", "t")},
-        "9×N": {"vicon": F["vicon"][:9]}, "N×12": {"vicon": F["vicon"].T}, "time too short": {"time": F["time"][:, 1:]},
+        "7×N": {"vicon": F["vicon"][:7]}, "N×12": {"vicon": F["vicon"].T}, "time too short": {"time": F["time"][:, 1:]},
         "text": {"vicon": "abc"}, "NaN in omg": {"data": row(4, omg=np.full((3, 1), np.nan))},
         "two omg": {"data": row(4, omg=np.zeros(2))}, "text in acc": {"data": row(4, acc="abc")},
         "no acc in a row": {"data": row(4, acc=np.zeros((0, 0)))}, "t goes back": {"data": row(4, t=1.0)},

@@ -20,6 +20,7 @@ from filterpy.kalman import (  # type: ignore[import-untyped]
     UnscentedKalmanFilter,
 )
 from PIL import Image
+from rerun.chunk import RrdReader
 
 import viz_estim
 from viz_estim import told
@@ -317,11 +318,67 @@ def test_it_draws(cli: Cli, tmp_path: Path) -> None:
     assert np.isfinite(run.truth[6:]).all()
 
 
+@pytest.mark.parametrize("told_of", ["residual", "z", "predicted"])
+@pytest.mark.parametrize("kind", ["gaussian", "particles"])
+def test_a_reading_of_a_place_is_drawn_where_it_was_told_alone(kind: str, told_of: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    names = {"x": "m", "y": "m"}
+    with viz_estim.record(tmp_path / "a.rrd", names, sensors={"gps": names}) as rec:
+        for k in range(20):
+            x, ν = np.array([10.0 + k, 5.0]), np.array([0.1, -0.2])
+            known = {"z": {"z": x + ν}, "predicted": {"predicted": x}}.get(told_of, {})
+            belief: dict[str, Any] = (
+                {"mean": x, "cov": np.eye(2)} if kind == "gaussian" else {"states": x + rng.normal(size=(30, 2))}
+            )
+            rec.stage("update", **belief, residual=ν, residual_cov=np.eye(2), sensor="gps", **known)
+            rec.step(time=k)
+    drawn = [
+        place
+        for chunk in RrdReader(tmp_path / "a.rrd").stream()
+        if chunk.entity_path == "/world/update/gps" and not chunk.is_static
+        for row in chunk.to_record_batch().column("Points3D:positions").to_pylist()
+        for place in row or []
+    ]
+    expected = [] if told_of == "residual" else [[10.1 + k, 4.8, 0.0] for k in range(20)]
+    np.testing.assert_allclose(drawn, expected, atol=1e-5)
+
+
+def test_a_reading_that_was_expected_at_the_origin_is_drawn(tmp_path: Path) -> None:
+    names = {"x": "m", "y": "m"}
+    with viz_estim.record(tmp_path / "a.rrd", names, sensors={"gps": names}) as rec:
+        for k in range(3):
+            rec.stage("predict", mean=[0.0, 0.0], cov=np.eye(2))
+            rec.stage("update", mean=[0.5, 0.5], cov=np.eye(2), residual=[1, 1], residual_cov=np.eye(2), sensor="gps")
+            rec.step(time=k)
+    rows = [
+        row
+        for chunk in RrdReader(tmp_path / "a.rrd").stream()
+        if chunk.entity_path == "/world/update/gps" and not chunk.is_static
+        for row in chunk.to_record_batch().column("Points3D:positions").to_pylist()
+    ]
+    assert [row for row in rows if row] == [[[1.0, 1.0, 0.0]]] * 3
+
+
 def test_a_group_s_state_has_more_numbers_than_directions(tmp_path: Path) -> None:
     with viz_estim.record(tmp_path / "a.rrd", Product(attitude=SO3())) as rec:
         rec.stage("predict", mean=[1, 0, 0, 0], cov=np.eye(3))
         rec.step(time=0, truth=[1, 0, 0, 0])
     assert viz_estim.load(tmp_path / "a.rrd").summary()["metrics"]["attitude_rmse_deg"] == 0.0
+
+
+def test_a_recording_that_was_closed_is_not_begun_anew(tmp_path: Path) -> None:
+    """As in a notebook, where the loop's cell is run again without the one that began the recording."""
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        for k in range(5):
+            rec.stage("predict", mean=[0.0], cov=[[1.0]])
+            rec.step(time=k)
+    kept = (tmp_path / "a.rrd").read_bytes()
+    with pytest.raises(ValueError, match="is closed"):
+        rec.stage("predict", mean=[0.0], cov=[[1.0]])
+    with pytest.raises(ValueError, match="is closed"):
+        rec.step(time=9)
+    rec.close()
+    assert (tmp_path / "a.rrd").read_bytes() == kept
 
 
 def test_without_names_components_are_counted(tmp_path: Path) -> None:

@@ -36,6 +36,7 @@ from viz_estim.diagnosis import (
 from viz_estim.diagnosis.evidence import Case, case
 from viz_estim.diagnosis.finding import CODES, SYMPTOMS, Finding
 from viz_estim.diagnosis.ranking import ranked
+from viz_estim.figures import one_line
 from viz_estim.recording import schema
 from viz_estim.recording.links import link
 from viz_estim.recording.marks import Mark
@@ -192,7 +193,7 @@ def _failure(run: Run) -> list[Finding]:
             None,
             (step, step),
             {"message": run.error},
-            f"the filter raised at {run.error}",
+            f"the filter raised at {one_line(run.error)}",
             f"`viz-estim debug FILE` opens at step {step}, with the stages that came before the failure",
         )
     ]

@@ -103,8 +103,16 @@ def _everything(run: Run) -> dict[str, Any]:
     arrays |= {f"inputs/{name}": values for name, values in run.inputs.items()}
     for table in run.stages.values():
         arrays |= {f"stages/{table.name}/step": table.step, f"stages/{table.name}/place": table.place}
-        arrays |= {f"stages/{table.name}/{name}": values for name, values in table.values.items()}
-    return arrays
+        for name, values in table.values.items():
+            arrays |= _plain(f"stages/{table.name}/{name}", values)
+    return arrays | ({"labels": np.array(run.labels)} if run.labels else {})
+
+
+def _plain(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """An array; of rows of different lengths all of them, one after the other, and beside them how many each has."""
+    if values.dtype != object:
+        return {name: values}
+    return {name: np.concatenate(list(values)), f"{name}.count": np.array([len(row) for row in values])}
 
 
 def _write_csv(file: IO[str], names: tuple[str, ...], rows: Array) -> None:

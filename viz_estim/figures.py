@@ -14,7 +14,7 @@ def lines(result: dict[str, Any]) -> list[str]:
     found = []
     if result.get("error"):
         error = result["error"]
-        found.append(f"FAILED at step {error['step']}, stage {error['stage']}: {error['message']}")
+        found.append(f"FAILED at step {error['step']}, stage {error['stage']}: {one_line(error['message'])}")
     width = max([24, *map(len, result["metrics"])])
     found += [f"  {name:{width}} {short(value)}" for name, value in result["metrics"].items()]
     for sensor, nis in result["nis"].items():
@@ -41,3 +41,8 @@ def short(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return "none" if value is None else "yes" if value else "no"
     return f"{value:.5g}" if isinstance(value, (float, np.floating)) else str(value)
+
+
+def one_line(text: str) -> str:
+    """A filter's own message on one line, whatever it was broken into."""
+    return " ".join(text.split())

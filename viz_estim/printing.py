@@ -11,7 +11,7 @@ import numpy as np
 
 from viz_estim import figures
 from viz_estim.core.measurement import split
-from viz_estim.figures import short
+from viz_estim.figures import one_line, short
 from viz_estim.parameters import kind_text, parameters
 
 if TYPE_CHECKING:
@@ -219,7 +219,7 @@ def step_text(run: Run, value: dict[str, Any]) -> str:
             else:
                 lines.append(f"  {name:18} {'×'.join(map(str, numbers.shape))} (see --json)")
     if value["error"]:
-        lines.append(f"FAILED in {value['error']['stage']}: {value['error']['message']}")
+        lines.append(f"FAILED in {value['error']['stage']}: {one_line(value['error']['message'])}")
     return "\n".join(lines)
 
 

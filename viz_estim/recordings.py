@@ -69,6 +69,7 @@ class Recording:
         self._count = 0
         self._recorder: Recorder | None = None
         self._failure: Failure | None = None
+        self._closed = False
         self._told = 0
         self._tally: Tally
 
@@ -106,6 +107,7 @@ class Recording:
         (N,) of a resampling; a figure of one's own, which is plotted. ValueError where a shape does not fit, or where a
         stage has other numbers than when it first came.
         """
+        self._check_open()
         if not re.fullmatch(r"[\w-]+", name):
             raise ValueError(f"stage {name!r}: a stage's name is of letters, digits, _ and -")
         where = f"stage {name}"
@@ -139,6 +141,7 @@ class Recording:
 
         Whether a truth is drawn is settled by the first step: give one there, of NaN if it is not known yet.
         """
+        self._check_open()
         if isinstance(time, np.ndarray) and time.size == 1:
             time = time.item()
         if not isinstance(time, (int, float, np.number)):
@@ -179,6 +182,7 @@ class Recording:
                 self._count += 1
             else:
                 self.step(time=time)
+        self._closed = True
         if self._recorder is None:
             return
         failure = self._failure
@@ -201,6 +205,10 @@ class Recording:
         if isinstance(error, Exception):
             self.fail(error)
         self.close()
+
+    def _check_open(self) -> None:
+        if self._closed:  # a step more would begin the file anew, over what it holds
+            raise ValueError(f"{self.path}: this recording is closed; begin another by viz_estim.record")
 
     def _add(self, step: Step) -> None:
         if self._recorder is None:

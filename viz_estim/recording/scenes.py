@@ -99,14 +99,24 @@ class Scenes:
             if self._reads_place(name):
                 style = Style(rr.Points3D, colors=[colour], radii=[-4.0])
                 path = schema.drawn(rows.name, name)
-                self._standing.draw(
-                    rows.name, field, path, at, style, 1, positions=flat3(mine[:, : 2 if self._layout.planar else 3])
-                )
+                told = self._told(rows, rows.some(f"{field}.predicted", kept)[:, space.at[name]], kept)
+                places = flat3(mine[told, : 2 if self._layout.planar else 3])
+                self._standing.draw(rows.name, field, path, at, style, told.astype(int), positions=places)
             elif own_scene(self._layout, name):
                 expected = rows.some(f"{field}.predicted", kept)[:, space.at[name]]
                 self._draw_arrows(rows.name, field, name, at, mine, expected, colour)
             else:
                 self._draw_ranges(rows, field, name, at, kept, mine, colour)
+
+    def _told(self, rows: StageRows, predicted: Array, kept: np.ndarray) -> np.ndarray:
+        """Which readings of a place are places: where a loop told the residual alone, zero stands for what was expected
+        though the estimate was elsewhere, and the residual for the reading."""
+        told: np.ndarray = predicted.any(1)
+        if not told.all() and self._layout.position and not self._layout.particles:
+            prior = np.full((len(rows.stages), len(self._layout.space.names)), np.nan)
+            prior[rows.has_prior] = rows.prior("mean")
+            told |= ~prior[kept][:, self._layout.space.at[self._layout.position]].any(1)
+        return told
 
     def _draw_arrows(
         self, stage: str, field: str, name: str, at: Times, z: Array, expected: Array, colour: schema.Colour

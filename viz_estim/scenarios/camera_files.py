@@ -19,7 +19,7 @@ from viz_estim.errors import BadInput
 from viz_estim.scenarios.imu_files import find_sets
 from viz_estim.scenarios.reading import expand, field, finite, mat_shapes, not_read, read_mat, shape_text, spelled
 
-_SUFFIXES = (".mat", ".csv", ".npz")
+_SUFFIXES = (".mat", ".csv", ".txt", ".npz")
 _ROLES = ("cam", "panorama")  # named as the field that tells it
 
 

@@ -1,9 +1,9 @@
 """Files of an IMU with motion capture: which file is what, reading, writing.
 
 The ESE 650 course's format: `imuRaw*.mat` (`vals` 6×T 10-bit counts in the order ax, ay, az, wz, wx, wy; `ts` 1×T,
-Unix s) and `viconRot*.mat` (`rots` 3×3×N body → world; `ts` 1×N). Any other log: CSV or NPZ with `time` [s],
-`gyro_x…z` [rad/s], `accel_x…z` [m/s²] and optionally `qw, qx, qy, qz` (body → world; NaN where there is no truth).
-Names in any case.
+Unix s) and `viconRot*.mat` (`rots` 3×3×N body → world; `ts` 1×N). Any other log: CSV, as `.txt` too, or NPZ with
+`time` [s], `gyro_x…z` [rad/s], `accel_x…z` [m/s²] and optionally `qw, qx, qy, qz` (body → world; NaN where there is no
+truth). Names in any case.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from viz_estim.scenarios.tables import Table, read_table
 _CHANNELS = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _GYRO_ROWS = [4, 5, 3]  # of `vals`: x, y, z
-_SUFFIXES = (".mat", ".csv", ".npz")
+_SUFFIXES = (".mat", ".csv", ".txt", ".npz")
 _STAMPS = ("ts", "time", "t", "timestamp", "timestamps")  # other people's names for them
 _SLOWEST = 1.0  # s between samples: no IMU is slower, so such stamps are in another unit
 
@@ -55,7 +55,7 @@ def find_sets(paths: list[Path]) -> list[tuple[Path, Path | None]]:
     truths = [file for file, role in roles.items() if role == "truth"]
     where = ", ".join(map(str, paths))
     if not imus:
-        what = "a .mat with `vals` and `ts`, or a .csv/.npz log with `time`"
+        what = "a .mat with `vals` and `ts`, or a .csv/.txt/.npz log with `time`"
         raise BadInput(f"{where}: no IMU file there ({what}){not_read(paths)}")
     if len(imus) == 1 and len(truths) == 1:
         return [(imus[0], truths[0])]

@@ -48,6 +48,12 @@ def prepare(log: PlazaLog) -> PlazaData:
     middle = 0.5 * (log.stamps[1:] + log.stamps[:-1])
     row = np.searchsorted(middle, log.range_stamps)
     near = np.abs(log.stamps[row] - log.range_stamps) <= typical
+    if not near.any():
+        raise BadInput(
+            f"{', '.join(map(str, log.files))}: no range came while there was odometry (`TD` is from "
+            f"{log.range_stamps[0]:g} to {log.range_stamps[-1]:g} s, `DR` from {log.stamps[0]:g} to "
+            f"{log.stamps[-1]:g} s); give stamps of one clock"
+        )
     count, total = (np.zeros((len(log.stamps), len(log.beacons))) for _ in range(2))
     np.add.at(count, (row[near], log.range_beacons[near]), 1)
     np.add.at(total, (row[near], log.range_beacons[near]), log.ranges[near])

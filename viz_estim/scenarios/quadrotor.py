@@ -48,7 +48,7 @@ def quadrotor(
         if seen:
             known = "the truth is motion capture" if len(flight.states) else "nothing tells the truth"
             return together(flight, seen, f"measured by the camera; {known}.", files)
-        seen = motion_capture(flight)
+        seen = motion_capture(flight, flight_file)
         notes = (
             "no camera's measurements, so that motion capture serves as the measured pose, and is the truth too: the "
             "errors show how closely the filter follows it, no more."

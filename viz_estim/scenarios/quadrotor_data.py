@@ -52,10 +52,13 @@ def together(flight: Flight, camera: Camera, notes: str, files: tuple[Path, ...]
     return QuadrotorData(flight.stamps, flight.gyro, flight.accel, pose, velocity, truth, notes, files)
 
 
-def motion_capture(flight: Flight) -> Camera:
+def motion_capture(flight: Flight, file: Path) -> Camera:
     """Motion capture in the camera's place: its pose at each sample of the IMU, and no velocity."""
     pose = _at(flight.stamps, flight.vicon_stamps, flight.states)[:, :7]
     known = np.isfinite(pose).all(1)
+    spacing = np.diff(flight.vicon_stamps)
+    if not known.any() and len(spacing) and (apart := float(np.median(spacing))) > _LONGEST_GAP:
+        raise BadInput(f"{file}: motion capture's poses are {apart:g} s apart, {_LONGEST_GAP} s is the most")
     return Camera(flight.stamps[known], pose[known], np.full((int(known.sum()), 3), np.nan))
 
 
@@ -79,7 +82,7 @@ def flight_along(camera: Camera, rng: np.random.Generator, file: Path) -> Flight
 def _at(times: Array, stamps: Array, states: Array) -> Array:
     """States (M, 16) at `times`, between samples (N, 16) at `stamps`; NaN outside, and in gaps that are too long."""
     found = np.full((len(times), states.shape[1]), np.nan)
-    good = np.isfinite(states[:, :10]).all(1)
+    good = np.isfinite(states[:, :7]).all(1)
     stamps, states = stamps[good], states[good]
     if len(stamps) < 2:
         return found

@@ -1,9 +1,10 @@
 """Files of a quadrotor's flight, in the formats of NYU's ROB-GY 6213: which file is what, reading, writing.
 
 The flight, `studentdata*.mat`: `data`, a struct array with `t` [s], `omg` [rad/s] and `acc` [m/s², specific force]
-(other fields such as `img` and `id`, and rows without a reading, are left); and motion capture, `vicon` 12×N (x, y, z,
-roll, pitch, yaw, then velocities of both) at `time` 1×N, NaN where it lost the body. What we write has the IMU's true
-biases too: `bias` 6×N (gyro, accelerometer). Beside a camera's file the motion capture may lack.
+(other fields such as `img` and `id`, and rows without a reading, are left), or one struct of arrays; and motion
+capture, `vicon` 12×N (x, y, z, roll, pitch, yaw, then velocities of both, which may lack) at `time` 1×N, NaN where it
+lost the body. What we write has the IMU's true biases too: `bias` 6×N (gyro, accelerometer). Beside a camera's file the
+motion capture may lack.
 
 The camera, `proj2_dataset*.mat`: `time`, `position`, `angle` (both of the body) and `linearVel` (of the camera, in its
 own frame), N×3. All angles are roll, pitch, yaw with R = Rz(yaw)·Ry(pitch)·Rx(roll), body → world.
@@ -98,7 +99,7 @@ def load_camera(path: Path) -> Camera:
     for name in ("position", "angle", "linearVel"):
         values = field(fields, name, path).astype(float)
         if values.shape != (len(stamps), 3):
-            raise BadInput(f"{path}: expected `{name}` of shape {len(stamps)}×3 as `time`, got {shape_text(values)}")
+            raise _misshapen(values, name, (len(stamps), 3), path)
         columns[name] = finite(values.T, path, name).T
     position, angle, velocity = columns.values()
     # A velocity takes two images: at the first there is none yet, and the file says 0.
@@ -115,14 +116,15 @@ def load_flight(path: Path) -> Flight:
         return Flight(stamps, gyro, accel, np.empty(0), np.empty((0, 16)))
     vicon_stamps = _stamps(field(fields, "time", path), path, "time")
     vicon = field(fields, "vicon", path).astype(float)
-    if vicon.shape != (12, len(vicon_stamps)):
-        raise BadInput(f"{path}: expected `vicon` of shape 12×{len(vicon_stamps)} as `time`, got {shape_text(vicon)}")
+    if vicon.shape not in [(rows, len(vicon_stamps)) for rows in (6, 9, 12)]:
+        raise _misshapen(vicon, "vicon", (12, len(vicon_stamps)), path)
+    velocity = vicon[6:9] if len(vicon) > 6 else np.full((3, len(vicon_stamps)), np.nan)
     bias = np.full((6, len(vicon_stamps)), np.nan)
     if any(name.lower() == "bias" for name in fields):
         bias = field(fields, "bias", path).astype(float)
         if bias.shape != (6, len(vicon_stamps)):
             raise BadInput(f"{path}: expected `bias` of shape 6×{len(vicon_stamps)}, got {shape_text(bias)}")
-    parts = [vicon[:3].T, quaternions.from_euler(vicon[3:6].T), vicon[6:9].T, bias.T]
+    parts = [vicon[:3].T, quaternions.from_euler(vicon[3:6].T), velocity.T, bias.T]
     return Flight(stamps, gyro, accel, vicon_stamps, np.concatenate(parts, axis=1))
 
 
@@ -136,6 +138,8 @@ def _imu(fields: dict[str, Any], path: Path) -> tuple[Array, Array, Array]:
     if missing:
         what = f"`data` has no {', '.join(missing)} (it has {', '.join(held) or 'no fields'})" if name else "no `data`"
         raise BadInput(f"{path}: {what}; expected a struct array with t, omg and acc")
+    if len(rows) == 1 and np.size(rows[0][found[0]]) > 1:
+        rows = _split(rows[0], found, path)
     columns: list[list[Array]] = [[], [], []]
     for k, row in enumerate(rows):
         try:
@@ -151,6 +155,27 @@ def _imu(fields: dict[str, Any], path: Path) -> tuple[Array, Array, Array]:
     t, gyro, accel = (np.array(column) for column in columns)
     stamps = _stamps(t, path, "data.t")
     return stamps, finite(gyro.T, path, "data.omg").T, finite(accel.T, path, "data.acc").T
+
+
+def _split(one: Any, found: list[str | None], path: Path) -> np.ndarray:
+    """The rows (T,) of one struct of arrays: t of T, omg and acc 3×T or T×3."""
+    T = np.size(one[found[0]])
+    rows = np.empty(T, dtype=[(name, object) for name in found])
+    for name, size in zip(found, (1, 3, 3), strict=True):
+        values = np.asarray(one[name])
+        if values.shape not in [(size, T), (T, size)]:
+            raise BadInput(
+                f"{path}: expected `data.{name}` of shape {size}×{T} as its stamps, got {shape_text(values)}"
+            )
+        rows[name] = list(values.reshape(T, size) if values.shape == (T, size) else values.T)
+    return rows
+
+
+def _misshapen(values: np.ndarray, name: str, shape: tuple[int, int], path: Path) -> BadInput:
+    """What to say of a field that is not of this shape; that of `time` is one of the two."""
+    remedy = "; transpose it" if values.shape == shape[::-1] else ""
+    expected = "×".join(map(str, shape))
+    return BadInput(f"{path}: expected `{name}` of shape {expected} as `time`, got {shape_text(values)}{remedy}")
 
 
 def _stamps(values: np.ndarray, path: Path, name: str) -> Array:
