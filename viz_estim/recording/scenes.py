@@ -111,7 +111,7 @@ class Scenes:
     def _told(self, rows: StageRows, predicted: Array, kept: np.ndarray) -> np.ndarray:
         """Which readings of a place are places: where a loop told the residual alone, zero stands for what was expected
         though the estimate was elsewhere, and the residual for the reading."""
-        told: np.ndarray = predicted.any(1)
+        told = np.asarray(predicted.any(1))
         if not told.all() and self._layout.position and not self._layout.particles:
             prior = np.full((len(rows.stages), len(self._layout.space.names)), np.nan)
             prior[rows.has_prior] = rows.prior("mean")
