@@ -21,6 +21,7 @@ CASES: dict[str, tuple[str, tuple[Any, ...]]] = {
     "norm.sf": ("sf", (np.concatenate([X, -X]),)),
     "norm.isf": ("isf", (P,)),
     "t.sf": ("sf", (np.concatenate([X, -X]), DOF)),
+    "t.isf": ("isf", (P, DOF)),
     "f.sf": ("sf", (X, DOF[1:], DOF[::-1][:-1])),
     "f.isf": ("isf", (P[1:], DOF[1:], DOF[::-1][:-1])),  # scipy's own is right to eight digits at 1e-9
     "binom.cdf": ("cdf", (np.arange(-1, 302), TRIALS, 0.3)),

@@ -8,9 +8,10 @@ from test_thresholds import case_of, severities
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean, Product
-from viz_estim.diagnosis import clocks, evidence, truth, weighing
-from viz_estim.diagnosis.finding import _FAMILIES, GROSS
+from viz_estim.diagnosis import clocks, confidence, errors, evidence, sensors, truth, weighing
+from viz_estim.diagnosis.finding import _FAMILIES, GROSS, times
 from viz_estim.diagnosis.fits import Against
+from viz_estim.scenarios.imu_health import GRAVITY, frozen_gyro, still_prefix
 
 SHARE = 0.05 / _FAMILIES  # of a check: warnings a run
 
@@ -72,3 +73,66 @@ def test_a_clock_is_told_by_its_unit_alone() -> None:
         (finding,) = clocks.clock(clocked(scale, rng))
         assert (finding.code, finding.severity) == ("stamps", "error")
         assert unit in finding.cause
+
+
+@pytest.mark.parametrize("count", [0.0, 0.017])
+@pytest.mark.parametrize("noise", [0.003, 0.05, 0.5])
+def test_noise_alone_is_neither_motion_nor_a_freeze(noise: float, count: float) -> None:
+    """At 1e-4 a run; also of readings in whole counts, and of far more noise than a cheap sensor's."""
+    rng, stamps = np.random.default_rng(14), 0.01 * np.arange(1500)
+    for _ in range(15):
+        gyro = rng.uniform(-0.2, 0.2, 3) + noise * rng.standard_normal((1500, 3))
+        accel = [0.0, 0.0, GRAVITY] + noise * rng.standard_normal((1500, 3))
+        if count:
+            gyro, accel = count * np.round(gyro / count), 6 * count * np.round(accel / (6 * count))
+        assert still_prefix(stamps, gyro, accel) == 1500
+        assert not frozen_gyro(stamps, gyro, accel, gyro[:50].mean(0)).any()
+
+
+def test_a_slow_motion_from_the_start_is_no_rest_whatever_the_noise() -> None:
+    rng, stamps = np.random.default_rng(15), 0.01 * np.arange(1500)
+    for noise in (0.003, 0.03):
+        gyro = 0.3 * np.sin(6 * stamps)[:, None] * [1.0, 0.5, 0.2] + noise * rng.standard_normal((1500, 3))
+        accel = [0.0, 0.0, GRAVITY] + noise * rng.standard_normal((1500, 3))
+        assert still_prefix(stamps, gyro, accel) == 0
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_errors_that_follow_one_another_keep_to_the_share(rho: float) -> None:
+    """AR(1) errors of the covariance's own size: no more of their mean squares lie outside than is stated."""
+    from scipy.signal import lfilter
+    from scipy.stats import chi2
+
+    rng, draws, found = np.random.default_rng(16), 200, 0
+    for _ in range(draws):
+        drawn = (1 - rho**2) ** 0.5 * rng.standard_normal((500, 2))
+        white = lfilter([1.0], [1.0, -rho], drawn, axis=0)[200:]
+        n = max(1.0, len(white) / errors._correlation_time(white))
+        total = n * float((white**2).sum(1).mean())
+        found += 2 * min(chi2.sf(total, 2 * n), chi2.cdf(total, 2 * n)) < SHARE / 2
+    assert found <= draws * SHARE + 3 * (draws * SHARE) ** 0.5
+
+
+@pytest.mark.parametrize("dof", [1, 3])
+def test_outliers_are_set_apart_without_more_alarms_of_size_and_a_large_noise_has_none(dof: int) -> None:
+    rng, draws = np.random.default_rng(17), 600
+    found = sum(confidence.size(rng.chisquare(dof, 200), dof)[1] < SHARE for _ in range(draws))
+    assert found <= draws * SHARE + 3 * (draws * SHARE) ** 0.5
+    assert not any(confidence._far(3 * rng.chisquare(dof, 400), dof).any() for _ in range(100))
+    glitches = np.append(rng.chisquare(dof, 400), [60.0] * 8)
+    assert confidence._far(glitches, dof)[-8:].all()
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.02, 0.1])
+def test_readings_lost_by_chance_are_no_silence(lost: float) -> None:
+    rng, draws, found = np.random.default_rng(18), 300, 0
+    for _ in range(draws):
+        z = np.where((rng.random(600) < lost)[:, None], np.nan, rng.standard_normal((600, 1)))
+        of = case_of(np.zeros((600, 1))).run
+        of = replace(of, inputs={"z.range": z}, step=np.arange(600), time=0.1 * np.arange(600))
+        found += bool(list(sensors.silent(of)))
+    assert found <= draws * SHARE + 3 * (draws * SHARE) ** 0.5
+
+
+def test_a_factor_near_one_keeps_three_digits() -> None:
+    assert [times(x) for x in (1.052, 0.983, 1.43, 22.1, 0.3)] == ["1.05×", "0.983×", "1.4×", "22×", "0.3×"]

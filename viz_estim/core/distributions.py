@@ -54,6 +54,10 @@ class t:
     def sf(x: Any, k: Any) -> Any:
         return special.stdtr(_positive(k), -np.asarray(x, float))
 
+    @staticmethod
+    def isf(p: Any, k: Any) -> Any:
+        return -special.stdtrit(_positive(k), np.asarray(p, float))
+
 
 class f:
     """Fisher's F with k and m degrees of freedom."""

@@ -12,19 +12,17 @@ import numpy as np
 from scipy.optimize import brentq
 
 from viz_estim.core.consistency import squared_distance
-from viz_estim.core.distributions import chi2, norm
+from viz_estim.core.distributions import binom, chi2, norm
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis import tuning
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import GROSS, ODDS, Finding, judge
+from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, Finding, judge, level, times
 
 # A covariance too small by GROSS is an error, by less a warning; too large is never one: it costs, and misleads nobody.
 # S goes as the root of Q, as that of a random walk does in its steady state, P ≈ √(Q·R): Q may be wrong by its square.
 _GROSS_Q = GROSS**2
 _FEWEST = 10
-_STUCK, _BEYOND = 0.9, 10.0  # so alike and so large that no noise would make them
-_TAIL, _MANY = 1e-3, 0.05
-_MOST, _MIDDLE = 0.2, 1.5
+_TAIL = 1e-3
 
 
 def by_sensor(case: Case) -> Iterator[Finding]:
@@ -77,7 +75,7 @@ def _by_sensor(case: Case) -> Iterator[Finding]:
             p_gross = min(p_gross, tuned["Q"].p_beyond(_GROSS_Q))
         severity = judge(p, 2 * len(case.sensors), large=p_gross)
         assert severity
-        spoken = spoken or process is not None or (rho > _STUCK and ratio > _BEYOND)
+        spoken = spoken or process is not None or _astray(ratio, rho)
         code = "overconfident" if over else "underconfident"
         words = _words(case, readings, ratio, factor, process, rho)
         yield Finding(code, severity, name, readings.steps, evidence, *words)
@@ -141,8 +139,8 @@ def size(nis: Array, dof: int) -> tuple[float, float, float]:
     """How large NIS are, as a multiple of what they should be; the chance of that; and that of as much or more if S is
     too small by GROSS.
 
-    Without those beyond the χ² quantile of 1 − 10⁻³, which are a matter of outliers, as long as these are few: the mean
-    of χ²(dof) below c is dof·F(c; dof + 2)/F(c; dof), its second moment dof·(dof + 2)·F(c; dof + 4)/F(c; dof).
+    Without those that are a matter of outliers (`_far`): the mean of χ²(dof) below c is dof·F(c; dof + 2)/F(c; dof),
+    its second moment dof·(dof + 2)·F(c; dof + 4)/F(c; dof).
     """
     c, far = chi2.isf(_TAIL, dof), _far(nis, dof)
     if not far.any():
@@ -158,10 +156,15 @@ def size(nis: Array, dof: int) -> tuple[float, float, float]:
 
 
 def _far(nis: Array, dof: int) -> np.ndarray:
-    """Which NIS (M,) are a matter of outliers; none where so many are far, and the middle too, that it is the noise."""
+    """Which NIS (M,) are a matter of outliers: those beyond χ²'s quantile of 1 − 10⁻³, where these are more than the
+    middle foretells by its size, or one is too far for it (at a warning's share, as in `innovations.outliers`); none
+    where the middle is too large by GROSS itself, for then it is the noise. The middle is an estimate, so that this
+    level is a few times its share; it sorts readings, and a finding's rate is that of `size`."""
     far = nis > chi2.isf(_TAIL, dof)
-    held = np.median(nis) < _MIDDLE * chi2.median(dof) and far.mean() <= _MOST
-    return far if far.mean() <= _MANY or held else np.zeros(len(nis), bool)
+    middle = max(1.0, float(np.median(nis)) / chi2.median(dof))
+    share = chi2.sf(chi2.isf(_TAIL, dof) / middle, dof)
+    p = min(binom.sf(far.sum() - 1, len(nis), share), len(nis) * chi2.sf(nis.max(initial=0.0) / middle, dof))
+    return far if middle < GROSS and p < level("warning", 1) else np.zeros(len(nis), bool)
 
 
 def factor_on_noise(readings: Readings) -> float | None:
@@ -190,12 +193,19 @@ def lag_one(white: Array) -> float:
     return float((white[1:] * white[:-1]).sum() / total) if total > 0 else 0.0
 
 
+def _astray(ratio: float, rho: float) -> bool:
+    """Whether innovations are so alike and so large that no noise would make them: each explains more of the next than
+    an error of Q would, by its square (`_GROSS_Q`), and they are larger than both a Q and an R that are errors make
+    them. It chooses words among causes and decides no rate."""
+    return rho > 0 and 1 - rho**2 < 1 / _GROSS_Q and ratio > GROSS * _GROSS_Q
+
+
 def _words(
     case: Case, readings: Readings, ratio: float, factor: float | None, process: float | None, rho: float
 ) -> tuple[str, str]:
     """Cause and remedy. factor: on R; process: on Q, where that explains the innovations better."""
     name = readings.name
-    size = f"innovations of {name} are {ratio**0.5:.2g}× as large as S says (mean NIS {ratio:.2g} of what it should be)"
+    size = f"innovations of {name} are {times(ratio**0.5)} as large as S says (mean NIS {times(ratio)} its due)"
     noise = parameter(case.run, f"{name}_noise")
     std = float(np.sqrt(np.diagonal(readings.noise, axis1=1, axis2=2).mean()))
     now = noise[1] if noise and isinstance(noise[1], float) else std
@@ -208,7 +218,7 @@ def _words(
         tuned = f"no R alone would explain it: look at the process noise of what {name} sees"
     else:
         tuned = f"set {where} to about {now * factor**0.5:.2g} (it is {now:.2g})"
-    if rho > _STUCK and ratio > _BEYOND:
+    if _astray(ratio, rho):
         return (
             f"{size}, and each is like the one before (autocorrelation {rho:.2f}): the estimate goes another way than "
             f"{name}, which no noise does",
@@ -222,6 +232,8 @@ def _words(
             + (f", or the model misses what moves {name}" if process > 1 else ""),
             _more_noise(process, tuning.factors(case)["Q"], case),
         )
+    if abs(ratio - 1) < SHEET:
+        return f"{size}: by little, and for sure only because there are so many readings", f"leave it; or {tuned}"
     if ratio > 1:
         by = "too small" if factor is None else f"{factor:.2g}× too small"
         return f"{size}: R of {name} is {by}, or the model misses what moves it", tuned

@@ -9,14 +9,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from viz_estim.core.distributions import chi2
+from viz_estim.core.distributions import chi2, norm
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis import clouds, motion
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, Finding, judge
+from viz_estim.diagnosis.finding import GROSS, Finding, judge, level, times
 from viz_estim.diagnosis.icp import is_registration
 
 _FEWEST = 10
+_AT_FIRST = 0.05  # of the run: how late the first error may be known that is still told of as the start's; no rate
 
 
 def start(case: Case) -> Iterator[Finding]:
@@ -31,7 +32,7 @@ def start(case: Case) -> Iterator[Finding]:
         return  # it starts where it is told to, and says so by no covariance
     table = run.stages.get("start")
     known_at = np.flatnonzero((run.step >= case.first) & np.isfinite(run.truth).any(1) & np.isfinite(run.mean).all(1))
-    if not len(known_at) or known_at[0] > run.row(step=case.whole[0]) + 0.05 * len(run.step):
+    if not len(known_at) or known_at[0] > run.row(step=case.whole[0]) + _AT_FIRST * len(run.step):
         return
     k = int(known_at[0])
     mean, P = run.mean[k], run.cov[k]
@@ -59,8 +60,9 @@ def by_part(case: Case) -> Iterator[Finding]:
     """Mean NEES of each part of the state, where truth is known, against χ² of as many errors as are independent.
 
     Errors are not white: of T there are T/τ independent ones, with τ = 1 + 2·Σρₖ² of the whitened errors'
-    autocorrelation about zero, up to its first ρₖ < 0.05 (Geyer 1992: an initial positive sequence). Twice that τ is
-    taken, for it is an estimate itself.
+    autocorrelation about zero, up to its first ρₖ ≤ 0 (Geyer 1992: an initial positive sequence). τ is an estimate
+    itself: of W lags its relative standard error is √(2·(2W + 1)/T) (Madras and Sokal 1988), and its upper limit at the
+    share of a warning is taken.
     """
     run = case.run
     if run.labels or "mean" not in run.ends or is_registration(case):
@@ -79,7 +81,7 @@ def by_part(case: Case) -> Iterator[Finding]:
     for name, steps, white in found:
         T, dof = white.shape
         mean = float((white**2).sum() / T)
-        independent = max(1.0, T / (2 * _correlation_time(np.asarray(white, float))))
+        independent = max(1.0, T / _correlation_time(np.asarray(white, float)))
         total = mean * independent
         p = 2 * min(chi2.sf(total, dof * independent), chi2.cdf(total, dof * independent))
         ratio = mean / dof
@@ -88,7 +90,7 @@ def by_part(case: Case) -> Iterator[Finding]:
             continue
         evidence = {"part": name, "mean_nees": mean, "dof": dof, "independent": independent, "p": p}
         code = "overconfident" if ratio > 1 else "underconfident"
-        what = f"the error of {name} is {ratio**0.5:.2g}× as large as its covariance says"
+        what = f"the error of {name} is {times(ratio**0.5)} as large as its covariance says"
         if ratio > 1:
             why, remedy = _too_sure(case, name)
             cause = f"{what}: {why}"
@@ -119,11 +121,13 @@ def _too_sure(case: Case, name: str) -> tuple[str, str]:
 
 
 def _correlation_time(white: Array) -> float:
-    """τ of the squares: 1 + 2·Σρₖ², with ρₖ about zero, since a whitened error's mean is known to be that."""
+    """The upper limit of τ of the squares: 1 + 2·Σρₖ², with ρₖ about zero, since a whitened error's mean is known to be
+    that."""
     T = len(white)
     spectrum = np.fft.rfft(white, 2 * T, axis=0)
     rho = np.fft.irfft((np.abs(spectrum) ** 2).sum(1))[:T]
     rho = rho / max(rho[0], 1e-300)
-    small = np.flatnonzero(rho < 0.05)
-    end = int(small[0]) if len(small) else T
-    return float(1 + 2 * (rho[1:end] ** 2).sum())
+    crossed = np.flatnonzero(rho <= 0)
+    end = int(crossed[0]) if len(crossed) else T
+    tau = float(1 + 2 * (rho[1:end] ** 2).sum())
+    return tau * (1 + float(norm.isf(level("warning", 1))) * (2 * (2 * end - 1) / T) ** 0.5)

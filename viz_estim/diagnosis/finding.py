@@ -79,6 +79,11 @@ def at_steps(count: int) -> str:
     return f"at {count} step{'s' * (count != 1)}"
 
 
+def times(factor: float) -> str:
+    """A factor in words: with three digits near 1, where two would say 1×."""
+    return f"{factor:.3g}×" if 0.9 < factor < 1.1 else f"{factor:.2g}×"
+
+
 @dataclass(frozen=True)
 class Finding:
     """steps: first and last, inclusive. evidence: numbers by name. cause and remedy speak to a student."""

@@ -7,16 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from viz_estim.core.distributions import binom, t
+from viz_estim.core.distributions import binom, chi2, norm, t
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.finding import Finding, judge, level
+from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, judge, level
 from viz_estim.recording.reader import Run
-from viz_estim.scenarios.imu_health import GRAVITY, frozen_accel, frozen_gyro, still_prefix
+from viz_estim.scenarios.imu_health import DRIFT, GRAVITY, frozen_accel, frozen_gyro, still_prefix
 
-_SLOWER = 3.0  # a pause of so many usual intervals is one in which readings are missing
 _AT_THE_END = 0.75  # of a smooth signal's extreme and next value: an arc sine has 0.71 at its extreme
 _CLIPPED = 0.02  # of the readings: a normal signal that is clipped there loses as much of its variance in one tail
-_RESTING = 0.05  # rad/s: more than that is no bias that was left over
 
 
 class Given(NamedTuple):
@@ -57,7 +55,7 @@ def imu(run: Run) -> Imu | None:
     if len(rows) < 20:
         return None
     length = np.median(np.linalg.norm(force[rows], axis=1))
-    return Imu(rows, rate[rows], force[rows] * (GRAVITY if abs(length - 1) < 0.05 else 1.0))
+    return Imu(rows, rate[rows], force[rows] * (GRAVITY if abs(length - 1) < SHEET else 1.0))
 
 
 def _driving(run: Run) -> Array | None:
@@ -126,9 +124,11 @@ def _left_out(run: Run, name: str, steps: tuple[int, int]) -> bool:
 
 
 def silent(run: Run) -> Iterator[Finding]:
-    """A pause in a sensor's readings: regular ones, of three usual intervals; irregular ones, by the chance of it.
+    """A pause in a sensor's readings that is too long for chance. An error where it lasts to the end, and is too long
+    even for arrivals that are as irregular as can be.
 
-    Regular: nineteen of twenty intervals are at most 1.5 medians. Else arrivals are taken as a Poisson process, whose
+    Of regular readings (nineteen of twenty intervals are at most 1.5 medians) each is lost with the share q that is
+    lost elsewhere, at least 1/N: k in a row with N·qᵏ at most. Else arrivals are taken as a Poisson process, whose
     longest of N pauses of mean μ exceeds g with 1 − (1 − e^(−g/μ))ᴺ.
     """
     sensors = given(run)
@@ -136,14 +136,17 @@ def silent(run: Run) -> Iterator[Finding]:
         if len(rows) < 10:
             continue
         gaps = np.diff(np.append(rows, len(run.step)))  # up to the run's end: there it is silent for good
-        usual = float(np.median(gaps))
+        usual, N = float(np.median(gaps)), len(gaps)
         regular = float(np.quantile(gaps, 0.95)) <= 1.5 * usual
         longest = int(np.argmax(gaps))
-        p = float(-np.expm1(len(gaps) * np.log1p(-np.exp(-gaps[longest] / gaps.mean()))))
+        irregular = -np.expm1(N * np.log1p(-np.exp(-gaps / gaps.mean())))
         if regular:
-            found = np.flatnonzero(gaps > max(_SLOWER * usual, usual + 2))
+            lost = np.maximum(np.round(gaps / usual) - 1, 0)
+            q = np.maximum(lost.sum() - lost, 1) / (N + lost.sum() - lost)
+            p = np.where((lost > 0) & (gaps > usual + 2), np.minimum(N * q**lost, 1.0), 1.0)
+            found = np.flatnonzero(p < level("warning", len(sensors)))
         else:
-            found = np.array([longest]) if judge(p, len(sensors), large=False) else np.array([], int)
+            found = np.array([longest]) if judge(irregular[longest], len(sensors), large=False) else np.array([], int)
         for k in found[:20]:
             first, end = int(rows[k]) + 1, int(rows[k]) + int(gaps[k])
             last = min(end, len(run.step)) - 1
@@ -152,7 +155,7 @@ def silent(run: Run) -> Iterator[Finding]:
             steps = int(run.step[first]), int(run.step[last])
             evidence = {"pause_s": span, "usual_steps": usual, "for_good": for_good}
             yield Finding(
-                "sensor_silent", "error" if for_good and gaps[k] > 10 * usual else "warning", name, steps, evidence,
+                "sensor_silent", judge(irregular[k], len(sensors), large=for_good) or "warning", name, steps, evidence,
                 f"the {name} gives no reading for {span:.3g} s"
                 + (", to the end of the run" if for_good else f", {gaps[k] / usual:.0f} of its usual intervals"),
                 "check the log and the wiring for lost messages; look whether the covariance grows meanwhile",
@@ -205,7 +208,9 @@ def biased_at_rest(run: Run) -> Iterator[Finding]:
     """A gyro that reads a rate while it lies still: its mean over the prefix's first half, by a t-test. Large is more
     than the noise of one reading.
 
-    Only where its readings are white, as those of a body at rest are.
+    Only where its readings are white, as those of a body at rest are: each axis's first autocorrelation, N(0, 1/n), by
+    half of the check's share. What an offset does not drift by since it was subtracted may be a slow turn, unless
+    gravity belies that.
     """
     both = imu(run)
     if both is None:
@@ -216,8 +221,8 @@ def biased_at_rest(run: Run) -> Iterator[Finding]:
     rest = both.rate[:still]
     about = rest - rest.mean(0)
     rho = (about[1:] * about[:-1]).sum(0) / np.maximum((about**2).sum(0), 1e-300)
-    fast = np.abs(rest.mean(0)).max() > _RESTING and not _belied(both, rest.mean(0), run, still)
-    if (np.abs(rho) > 3 / np.sqrt(still)).any() or fast:
+    fast = np.abs(rest.mean(0)).max() > DRIFT[0] and not _belied(both, rest.mean(0), run, still)
+    if (np.abs(rho) > norm.isf(level("warning", 6)) / np.sqrt(still)).any() or fast:
         return  # readings that follow one another, or too large: it turns, however slowly
     error = rest.std(0, ddof=1) / np.sqrt(still)
     score = rest.mean(0) / np.where(error > 0, error, np.inf)
@@ -238,14 +243,15 @@ def biased_at_rest(run: Run) -> Iterator[Finding]:
 
 
 def _belied(both: Imu, rate: Array, run: Run, still: int) -> bool:
-    """Whether gravity stays where it is, though a rate (3,) would have turned it over `still` readings by far more than
-    the accelerometer's noise."""
+    """Whether gravity turned, from the first half of `still` readings to the second, by less than 1/GROSS of what a
+    rate (3,) would have made it, for sure: what noise adds to that is χ²(3) at most, at the check's share."""
     force = both.force[:still] / np.linalg.norm(both.force[:still], axis=1, keepdims=True)
     first, last = force[: still // 2], force[still // 2 :]
     span = float(run.time[both.rows[still - 1]] - run.time[both.rows[0]])
     would = float(np.linalg.norm(np.cross(rate, force.mean(0)))) * 0.5 * span
-    noise = float(force.std(0).max()) * 2 / np.sqrt(still / 2)
-    return would > 5 * (float(np.linalg.norm(last.mean(0) - first.mean(0))) + noise)
+    error = float(np.sqrt(first.var(0, ddof=1).max() / len(first) + last.var(0, ddof=1).max() / len(last)))
+    bound = float(np.sqrt(chi2.isf(level("warning", 3), 3))) * error
+    return would > GROSS * (float(np.linalg.norm(last.mean(0) - first.mean(0))) + bound)
 
 
 def runs(flags: np.ndarray) -> list[tuple[int, int]]:
