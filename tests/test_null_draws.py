@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
+from scipy.stats import chi2
 from test_thresholds import case_of, severities
 
 from viz_estim.core.quaternions import Array
@@ -100,9 +102,6 @@ def test_a_slow_motion_from_the_start_is_no_rest_whatever_the_noise() -> None:
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_errors_that_follow_one_another_keep_to_the_share(rho: float) -> None:
     """AR(1) errors of the covariance's own size: no more of their mean squares lie outside than is stated."""
-    from scipy.signal import lfilter
-    from scipy.stats import chi2
-
     rng, draws, found = np.random.default_rng(16), 200, 0
     for _ in range(draws):
         drawn = (1 - rho**2) ** 0.5 * rng.standard_normal((500, 2))

@@ -318,6 +318,17 @@ def test_it_draws(cli: Cli, tmp_path: Path) -> None:
     assert np.isfinite(run.truth[6:]).all()
 
 
+def gps_drawn(path: Path) -> list[list[list[float]]]:
+    """The places of the stage `update`'s readings by `gps` as drawn, row by row, where a row has any."""
+    return [
+        row
+        for chunk in RrdReader(path).stream()
+        if chunk.entity_path == "/world/update/gps" and not chunk.is_static
+        for row in chunk.to_record_batch().column("Points3D:positions").to_pylist()
+        if row
+    ]
+
+
 @pytest.mark.parametrize("told_of", ["residual", "z", "predicted"])
 @pytest.mark.parametrize("kind", ["gaussian", "particles"])
 def test_a_reading_of_a_place_is_drawn_where_it_was_told_alone(kind: str, told_of: str, tmp_path: Path) -> None:
@@ -332,13 +343,7 @@ def test_a_reading_of_a_place_is_drawn_where_it_was_told_alone(kind: str, told_o
             )
             rec.stage("update", **belief, residual=ν, residual_cov=np.eye(2), sensor="gps", **known)
             rec.step(time=k)
-    drawn = [
-        place
-        for chunk in RrdReader(tmp_path / "a.rrd").stream()
-        if chunk.entity_path == "/world/update/gps" and not chunk.is_static
-        for row in chunk.to_record_batch().column("Points3D:positions").to_pylist()
-        for place in row or []
-    ]
+    drawn = [place for row in gps_drawn(tmp_path / "a.rrd") for place in row]
     expected = [] if told_of == "residual" else [[10.1 + k, 4.8, 0.0] for k in range(20)]
     np.testing.assert_allclose(drawn, expected, atol=1e-5)
 
@@ -350,13 +355,7 @@ def test_a_reading_that_was_expected_at_the_origin_is_drawn(tmp_path: Path) -> N
             rec.stage("predict", mean=[0.0, 0.0], cov=np.eye(2))
             rec.stage("update", mean=[0.5, 0.5], cov=np.eye(2), residual=[1, 1], residual_cov=np.eye(2), sensor="gps")
             rec.step(time=k)
-    rows = [
-        row
-        for chunk in RrdReader(tmp_path / "a.rrd").stream()
-        if chunk.entity_path == "/world/update/gps" and not chunk.is_static
-        for row in chunk.to_record_batch().column("Points3D:positions").to_pylist()
-    ]
-    assert [row for row in rows if row] == [[[1.0, 1.0, 0.0]]] * 3
+    assert gps_drawn(tmp_path / "a.rrd") == [[[1.0, 1.0, 0.0]]] * 3
 
 
 def test_a_group_s_state_has_more_numbers_than_directions(tmp_path: Path) -> None:

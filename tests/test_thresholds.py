@@ -36,7 +36,7 @@ def case_of(white: Array, used: np.ndarray | None = None, gate: float | None = N
         np.ones(N, bool) if used is None else used,
     )  # fmt: skip
     recorded = replace(walk(), properties=walk().properties | {"params": {"gate": gate}})
-    return evidence.Case(recorded, {"range": readings}, evidence.Sequence(recorded), tune=False)
+    return evidence.Case(recorded, {"range": readings}, evidence.Sequence(recorded))
 
 
 def severities(found: Any) -> list[tuple[str, str]]:
@@ -44,7 +44,7 @@ def severities(found: Any) -> list[tuple[str, str]]:
 
 
 CHECKS = {
-    "size": (confidence.by_sensor, lambda w: GROSS**0.5 * w),
+    "size": (functools.partial(confidence.by_sensor, tune=False), lambda w: GROSS**0.5 * w),
     "bias": (innovations.biased, lambda w: w + 0.5),  # (S − R)/S = 1/4
     "colour": (innovations.coloured, lambda w: coloured(w, 1 / 3)),
 }

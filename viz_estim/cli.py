@@ -14,7 +14,7 @@ import numpy as np
 
 from viz_estim import diagnosing, printing, progress
 from viz_estim.debugger import commands as debugging
-from viz_estim.errors import BadInput
+from viz_estim.errors import BadInput, one_line
 from viz_estim.files import check_writable
 
 _ENDINGS = {"tum": (".tum", ".txt"), "csv": (".csv",), "npz": (".npz",)}  # of what `export` writes
@@ -22,7 +22,7 @@ _ENDINGS = {"tum": (".tum", ".txt"), "csv": (".csv",), "npz": (".npz",)}  # of w
 
 def main(argv: list[str] | None = None) -> int:
     """Runs one command; returns the exit code: 0 done, 1 the answer is "no", 2 wrong usage or bad input."""
-    arguments = argparse.Namespace(command=None)
+    arguments = argparse.Namespace(records=False)
     try:
         _parser().parse_args(argv, arguments)
         command: Callable[[argparse.Namespace], int | None] = arguments.command
@@ -41,8 +41,10 @@ def main(argv: list[str] | None = None) -> int:
     except MemoryError as error:
         return _refuse(f"not enough memory ({error or 'out of memory'}); ask for less: fewer particles, a shorter run")
     except KeyboardInterrupt:
-        records = getattr(arguments.command, "__name__", "") in ("_run", "fork")  # others leave nothing
-        return _refuse("interrupted" + records * "; what was recorded so far is in the .partial.rrd file", 130)
+        # Commands that record say so among their options; others leave nothing.
+        return _refuse(
+            "interrupted" + arguments.records * "; what was recorded so far is in the .partial.rrd file", 130
+        )
     except RuntimeError as error:
         from viz_estim.recording.viewer import ViewerError
 
@@ -62,7 +64,7 @@ def entry() -> NoReturn:
 
 
 def _refuse(message: str, code: int = 2) -> int:
-    print(f"viz-estim: {' '.join(message.split())}", file=sys.stderr)
+    print(f"viz-estim: {one_line(message)}", file=sys.stderr)
     return code
 
 
@@ -87,6 +89,7 @@ def _parser() -> argparse.ArgumentParser:
     p = command("list", _list, "every scenario: name, one line, its parameters")
     _json(p)
     p = command("run", _run, "run a scenario and record it")
+    p.set_defaults(records=True)
     p.add_argument("scenario", metavar="SCENARIO", help="a name (see list) or FILE.py:function")
     _inputs(p)
     p.add_argument("--out", type=Path, metavar="FILE", help="the recording (default: recordings/SCENARIO….rrd)")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -36,7 +35,7 @@ from viz_estim.diagnosis import (
 from viz_estim.diagnosis.evidence import Case, case
 from viz_estim.diagnosis.finding import CODES, SYMPTOMS, Finding
 from viz_estim.diagnosis.ranking import ranked
-from viz_estim.figures import one_line
+from viz_estim.errors import one_line
 from viz_estim.recording import schema
 from viz_estim.recording.links import link
 from viz_estim.recording.marks import Mark
@@ -112,8 +111,7 @@ def diagnose(run: Run) -> list[Finding]:
             found += motion.prediction(under_test)  # else the filter knows how wrong it is
         # Noises are tuned once nothing else is wrong: until then a factor on them would only hide it.
         causes = [f for f in ranked(found) if f.severity == "error" and f.tier <= _TIMES and f.code != "start"]
-        # The case itself where it can be, for it keeps what was tuned before.
-        found += confidence.by_sensor(replace(under_test, tune=False) if causes else under_test)
+        found += confidence.by_sensor(under_test, tune=not causes)
     return sorted(_once(ranked(found)), key=lambda finding: finding.order)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from viz_estim.core.consistency import band
+from viz_estim.errors import one_line
 
 
 def lines(result: dict[str, Any]) -> list[str]:
@@ -41,8 +42,3 @@ def short(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return "none" if value is None else "yes" if value else "no"
     return f"{value:.5g}" if isinstance(value, (float, np.floating)) else str(value)
-
-
-def one_line(text: str) -> str:
-    """A filter's own message on one line, whatever it was broken into."""
-    return " ".join(text.split())

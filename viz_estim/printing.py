@@ -11,7 +11,8 @@ import numpy as np
 
 from viz_estim import figures
 from viz_estim.core.measurement import split
-from viz_estim.figures import one_line, short
+from viz_estim.errors import one_line
+from viz_estim.figures import short
 from viz_estim.parameters import kind_text, parameters
 
 if TYPE_CHECKING:

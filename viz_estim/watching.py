@@ -15,6 +15,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from viz_estim.errors import one_line
 from viz_estim.recordings import Recording
 from viz_estim.told import Names, vector
 
@@ -134,8 +135,7 @@ class Watched(Recording):
             function(*args, **kwargs)
         except Exception as error:
             self._gave_up = True
-            text = " ".join(str(error).split())
-            self.say(f"recorded up to step {max(self._count - 1, 0)} alone ({type(error).__name__}: {text})")
+            self.say(f"recorded up to step {max(self._count - 1, 0)} alone ({type(error).__name__}: {one_line(error)})")
 
 
 def _unwrap(owner: Any, name: str, wrapped: Any) -> None:

@@ -31,6 +31,7 @@ def add(
         print(printing.result_text(result))
 
     p = command("fork", fork, "the same run again, with other estimator parameters from a step on")
+    p.set_defaults(records=True)
     p.add_argument("file", type=Path, metavar="FILE")
     p.add_argument("--at", type=int, required=True, metavar="STEP")
     p.add_argument("--set", action="append", required=True, metavar="K=V", dest="settings", help="a parameter")

@@ -12,7 +12,7 @@ from viz_estim.debugger.functions import BadExpression
 from viz_estim.debugger.quantities import Frame
 from viz_estim.debugger.screen import Screen
 from viz_estim.debugger.sources import NoSuchPlace
-from viz_estim.errors import BadInput
+from viz_estim.errors import BadInput, one_line
 
 # In the help's order.
 COMMANDS = (
@@ -71,11 +71,11 @@ class Console(cmd.Cmd):
                 return True
             return bool(super().onecmd(self._written_out(line)))
         except (Refused, BadExpression, NoSuchPlace, BadInput) as error:
-            self.say(f"error: {_one_line(error)}")
+            self.say(f"error: {one_line(error)}")
         except KeyboardInterrupt:
             self.say("interrupted")
         except (Exception, SystemExit) as error:  # whatever it is, of a person's filter too: it costs no session
-            self.say(f"error: {type(error).__name__}: {_one_line(error)}")
+            self.say(f"error: {type(error).__name__}: {one_line(error)}")
         return False
 
     def completenames(self, text: str, *ignored: object) -> list[str]:
@@ -114,7 +114,3 @@ def count(text: str) -> int:
     if not re.fullmatch(r"[0-9]{0,9}", text):
         raise Refused(f"{text}: expected a whole number from 0 on")
     return int(text) if text else 1
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())

@@ -25,10 +25,10 @@ _FEWEST = 10
 _TAIL = 1e-3
 
 
-def by_sensor(case: Case) -> Iterator[Finding]:
+def by_sensor(case: Case, *, tune: bool) -> Iterator[Finding]:
     """The size of each sensor's innovations (`_by_sensor`); and where one sensor's are too large and another's too
     small, whether their noises are exchanged, which must be likelier than any other factor on either, by ODDS."""
-    found = list(_by_sensor(case))
+    found = list(_by_sensor(case, tune))
     sizes = {f.sensor: f for f in found if f.sensor and f.evidence.get("gain_by_R") is not None}
     for large, over in sizes.items():
         for small, under in sizes.items():
@@ -48,7 +48,7 @@ def _as_many(case: Case, one: str, other: str) -> bool:
     return case.sensors[one].dof == case.sensors[other].dof
 
 
-def _by_sensor(case: Case) -> Iterator[Finding]:
+def _by_sensor(case: Case, tune: bool) -> Iterator[Finding]:
     """Mean NIS of a sensor outside its χ² band: the sum of N of them is χ²(N·dof) (eq. 5.4.2-9)."""
     spoken = False
     for name, readings in case.sensors.items():
@@ -59,7 +59,7 @@ def _by_sensor(case: Case) -> Iterator[Finding]:
         if judge(p, 2 * len(case.sensors), large=False) is None:
             continue
         over = ratio > 1
-        tuned, rho = tuning.factors(case) if case.tune else {}, lag_one(readings.white)
+        tuned, rho = tuning.factors(case) if tune else {}, lag_one(readings.white)
         factor = tuned[name].factor if name in tuned else factor_on_noise(readings.pick(~_far(readings.nis, dof)))
         if factor is not None and ((factor > 1) != over or not 1e-4 < factor < 1e4):
             factor = None
@@ -79,7 +79,7 @@ def _by_sensor(case: Case) -> Iterator[Finding]:
         code = "overconfident" if over else "underconfident"
         words = _words(case, readings, ratio, factor, process, rho)
         yield Finding(code, severity, name, readings.steps, evidence, *words)
-    if not spoken:
+    if tune and not spoken:
         yield from _by_process(case)
 
 
@@ -90,7 +90,7 @@ def _by_process(case: Case) -> Iterator[Finding]:
     look odd at the level of 0.05, by their size or by Ljung and Box, which can but lower its false alarms.
     """
     looks = [min(size(r.nis, r.dof)[1], ljung_box(r)) for r in case.sensors.values() if len(r) >= 2 * _FEWEST]
-    if not case.tune or not looks or min(looks) > 0.05:
+    if not looks or min(looks) > 0.05:
         return
     tuned = tuning.factors(case)
     if "Q" not in tuned or any(tuned[name].gain > tuned["Q"].gain for name in tuned):

@@ -154,7 +154,6 @@ class Case:
     run: Run
     sensors: dict[str, Readings]
     sequence: Sequence
-    tune: bool = True  # whether noises are worth tuning: nothing else is known to be wrong
 
     @property
     def space(self) -> Product:

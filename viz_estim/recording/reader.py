@@ -18,7 +18,7 @@ from viz_estim.core.consistency import FIT, summary
 from viz_estim.core.descriptions import rebuild
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
-from viz_estim.errors import BadInput
+from viz_estim.errors import BadInput, one_line
 from viz_estim.recording import schema
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.rescue import last_whole, whole
@@ -218,8 +218,7 @@ def _chunks(path: Path, also: Iterable[str]) -> Iterator[Any]:
                 reader = RrdReader(sound)
             yield from reader.stream().filter(content=content)
     except (ValueError, OSError, RuntimeError) as error:
-        text = " ".join(str(error).split())
-        raise BadInput(f"{path}: not a readable recording, or damaged ({text[:120]})") from error
+        raise BadInput(f"{path}: not a readable recording, or damaged ({one_line(error)[:120]})") from error
 
 
 def _points(batch: pa.RecordBatch) -> Array | None:

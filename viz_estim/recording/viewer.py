@@ -15,6 +15,7 @@ from typing import Any
 import rerun_cli
 from rerun.experimental import ViewerClient, ViewerState
 
+from viz_estim.errors import one_line
 from viz_estim.recording import links
 from viz_estim.recording.moments import goal_of, polls
 from viz_estim.recording.rescue import has_rows, whole
@@ -156,7 +157,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
         """What views could not draw, and what the viewer warned of since the newest `open`: a line each."""
         reports = [(view.name, report) for view in self._state().views for report in view.reports]
         lines = [f"{name}: {report.severity}: {report.summary} {report.details or ''}" for name, report in reports]
-        return [" ".join(line.split()) for line in lines] + self._logged("WARN", "ERROR")
+        return [one_line(line) for line in lines] + self._logged("WARN", "ERROR")
 
     def views(self) -> list[tuple[str, str, bool]]:
         """Name, class (`3D`, `TimeSeries`, …) and visibility of each view of the blueprint in front."""
@@ -232,7 +233,7 @@ class Viewer(contextlib.AbstractContextManager["Viewer"]):
     def _logged(self, *levels: str) -> list[str]:
         known = [entry for entry in self._ask(self._client.get_logs, self._seen) if entry.level in levels]
         entries = [entry for entry in known if not entry.message.startswith(_RETAKEN)]
-        return [" ".join(f"viewer: {entry.level.lower()}: {entry.message}".split()) for entry in entries]
+        return [one_line(f"viewer: {entry.level.lower()}: {entry.message}") for entry in entries]
 
     def _printed(self) -> str:
         return os.pread(self._log.fileno(), 1 << 20, 0).decode(errors="replace")  # seek would move the viewer's offset

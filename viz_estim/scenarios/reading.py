@@ -10,7 +10,7 @@ import numpy as np
 import scipy.io
 
 from viz_estim.core.quaternions import Array
-from viz_estim.errors import BadInput
+from viz_estim.errors import BadInput, one_line
 
 _HDF5 = "is MATLAB v7.3 (HDF5), which is not read; in MATLAB save it anew with save(FILE, '-v7')"
 
@@ -88,7 +88,7 @@ def unreadable(path: Path, error: Exception) -> BadInput:
         return BadInput(f"{path}: cannot be opened ({closed.strerror})")
     if _is_hdf5(path):
         return BadInput(f"{path}: {_HDF5}")
-    text = " ".join(str(error).split()) or type(error).__name__
+    text = one_line(error) or type(error).__name__
     return BadInput(f"{path}: cannot be read, it may be truncated or of another format ({text[:120]})")
 
 
