@@ -1,8 +1,7 @@
 """What a newcomer stumbles over: files that are none, runs cut short at once, numbers that are none."""
 
-import os
+import io
 import runpy
-import subprocess
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -13,6 +12,7 @@ from conftest import Cli
 from rerun.chunk import RrdReader
 
 import viz_estim
+from viz_estim.cli import entry
 from viz_estim.recording.rescue import whole
 
 
@@ -100,23 +100,34 @@ def test_a_trajectory_without_a_number_is_refused(tmp_path: Path, cli: Cli) -> N
     assert "no trajectory" in done.err
 
 
-@pytest.mark.parametrize("command", [["show", "--step", "1"], ["diagnose"], ["compare"]])
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252"])
-def test_a_terminal_of_another_alphabet_shows_what_it_can(command: list[str], encoding: str, tmp_path: Path) -> None:
-    with viz_estim.record(tmp_path / "a.rrd", {"x": "m"}) as rec:
+@pytest.fixture(scope="module")
+def told_in_greek(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of which commands say σ and ×."""
+    path = tmp_path_factory.mktemp("greek") / "a.rrd"
+    with viz_estim.record(path, {"x": "m"}) as rec:
         for k in range(40):
             rec.stage("update", mean=[0], cov=[[1]], residual=[9.0], residual_cov=[[1]], gain=[[0.1]])
             rec.step(time=k)
-    files = [tmp_path / "a.rrd"] * (2 if command == ["compare"] else 1)
+    return path
+
+
+@pytest.mark.parametrize("command", [["show", "--step", "1"], ["diagnose"], ["compare"]])
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp1252"])
+def test_a_terminal_of_another_alphabet_shows_what_it_can(
+    command: list[str], encoding: str, told_in_greek: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [told_in_greek] * (2 if command == ["compare"] else 1)
     more = ["--out", tmp_path / "b.rrd"] if command == ["compare"] else []
-    done = subprocess.run(
-        [sys.executable, "-m", "viz_estim", command[0], *files, *command[1:], *more],
-        env=os.environ | {"PYTHONIOENCODING": encoding},
-        capture_output=True,
-    )  # fmt: skip
-    assert done.returncode in (0, 1), done.stderr
-    assert b"Traceback" not in done.stderr
-    assert "?" in done.stdout.decode(encoding) or command == ["compare"]
+    arguments = [command[0], *files, *command[1:], *more]
+    monkeypatch.setattr(sys, "argv", ["viz-estim", *(str(argument) for argument in arguments)])
+    streams = {name: io.TextIOWrapper(io.BytesIO(), encoding=encoding) for name in ("stdout", "stderr")}
+    for name, stream in streams.items():
+        monkeypatch.setattr(sys, name, stream)
+    with pytest.raises(SystemExit) as ended:
+        entry()
+    assert ended.value.code in (0, 1)
+    streams["stdout"].seek(0)
+    assert "?" in streams["stdout"].read() or command == ["compare"]
 
 
 def test_the_package_is_a_program(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
