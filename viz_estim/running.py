@@ -23,8 +23,10 @@ from viz_estim.core.run import Scenario, Step, run
 from viz_estim.errors import BadInput
 from viz_estim.files import check_writable, claimed, make_folder, sha256
 from viz_estim.parameters import assign, check_seed, nearest, parameters
-from viz_estim.recording.recorder import Recorder, partial_of
 from viz_estim.scenarios import SCENARIOS, SYSTEMS
+
+if typing.TYPE_CHECKING:
+    from viz_estim.recording.recorder import Recorder
 
 Progress = Callable[[int, int], None]
 
@@ -237,6 +239,8 @@ def recorded(steps: Iterator[Step], scenario: Scenario, recorder: Recorder, prog
 
 def execute(planned: Plan, out: Path | None, *, every: int, live: str | None, progress: Progress) -> dict[str, Any]:
     """Runs a plan and records it; returns what `run --json` prints."""
+    from viz_estim.recording.recorder import Recorder, partial_of  # here: whoever does not record need not wait for it
+
     scenario = planned.build()
     path = out or Path("recordings") / f"{planned.title()}.rrd"
     if out is None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy import special
+import scipy
 
 
 class chi2:
@@ -16,19 +16,19 @@ class chi2:
 
     @staticmethod
     def cdf(x: Any, k: Any) -> Any:
-        return special.chdtr(_positive(k), np.maximum(x, 0.0))
+        return scipy.special.chdtr(_positive(k), np.maximum(x, 0.0))
 
     @staticmethod
     def sf(x: Any, k: Any) -> Any:
-        return special.chdtrc(_positive(k), np.maximum(x, 0.0))
+        return scipy.special.chdtrc(_positive(k), np.maximum(x, 0.0))
 
     @staticmethod
     def ppf(p: Any, k: Any) -> Any:
-        return 2 * special.gammaincinv(0.5 * _positive(k), np.asarray(p, float))
+        return 2 * scipy.special.gammaincinv(0.5 * _positive(k), np.asarray(p, float))
 
     @staticmethod
     def isf(p: Any, k: Any) -> Any:
-        return special.chdtri(_positive(k), p)
+        return scipy.special.chdtri(_positive(k), p)
 
     @staticmethod
     def median(k: Any) -> Any:
@@ -40,11 +40,11 @@ class norm:
 
     @staticmethod
     def sf(x: Any) -> Any:
-        return special.ndtr(-np.asarray(x, float))
+        return scipy.special.ndtr(-np.asarray(x, float))
 
     @staticmethod
     def isf(p: Any) -> Any:
-        return -special.ndtri(np.asarray(p, float))
+        return -scipy.special.ndtri(np.asarray(p, float))
 
 
 class t:
@@ -52,11 +52,11 @@ class t:
 
     @staticmethod
     def sf(x: Any, k: Any) -> Any:
-        return special.stdtr(_positive(k), -np.asarray(x, float))
+        return scipy.special.stdtr(_positive(k), -np.asarray(x, float))
 
     @staticmethod
     def isf(p: Any, k: Any) -> Any:
-        return -special.stdtrit(_positive(k), np.asarray(p, float))
+        return -scipy.special.stdtrit(_positive(k), np.asarray(p, float))
 
 
 class f:
@@ -64,11 +64,12 @@ class f:
 
     @staticmethod
     def sf(x: Any, k: Any, m: Any) -> Any:
-        return special.fdtrc(_positive(k), _positive(m), np.maximum(x, 0.0))
+        return scipy.special.fdtrc(_positive(k), _positive(m), np.maximum(x, 0.0))
 
     @staticmethod
     def isf(p: Any, k: Any, m: Any) -> Any:
-        return 1 / special.fdtri(_positive(m), _positive(k), p)  # the inverse has m and k; 1 − p would be 1 for small p
+        # The inverse has m and k: 1 − p would be 1 for small p.
+        return 1 / scipy.special.fdtri(_positive(m), _positive(k), p)
 
 
 class binom:
@@ -78,14 +79,14 @@ class binom:
     def cdf(k: Any, n: Any, q: Any) -> Any:
         """P(at most k) = I₁₋q(n − k, k + 1), the incomplete beta function."""
         k = np.floor(k)
-        inside = special.betainc(np.maximum(n - k, 1), np.maximum(k + 1, 1), 1.0 - q)
+        inside = scipy.special.betainc(np.maximum(n - k, 1), np.maximum(k + 1, 1), 1.0 - q)
         return np.where(k < 0, 0.0, np.where(k >= n, 1.0, inside))[()]
 
     @staticmethod
     def sf(k: Any, n: Any, q: Any) -> Any:
         """P(more than k) = I_q(k + 1, n − k)."""
         k = np.floor(k)
-        inside = special.betainc(np.maximum(k + 1, 1), np.maximum(n - k, 1), q)
+        inside = scipy.special.betainc(np.maximum(k + 1, 1), np.maximum(n - k, 1), q)
         return np.where(k < 0, 1.0, np.where(k >= n, 0.0, inside))[()]
 
 

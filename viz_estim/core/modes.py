@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter
+import scipy
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
@@ -104,7 +104,7 @@ def _histogram(points: Array, weights: Array) -> tuple[np.ndarray, Array]:
     at = np.clip(np.floor(centred / size), -half, half - 1).astype(int) + half
     cell = np.ravel_multi_index(tuple(at.T), (2 * half,) * d)
     histogram = np.bincount(cell, weights, (2 * half) ** d).reshape((2 * half,) * d)
-    return cell, gaussian_filter(histogram, _SMOOTH, mode="constant")
+    return cell, scipy.ndimage.gaussian_filter(histogram, _SMOOTH, mode="constant")
 
 
 def _basins(density: Array) -> np.ndarray:
@@ -113,7 +113,7 @@ def _basins(density: Array) -> np.ndarray:
     order = density.ravel().argsort(kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(order.size)
-    peak = order[maximum_filter(rank.reshape(density.shape), size=3)].ravel()
+    peak = order[scipy.ndimage.maximum_filter(rank.reshape(density.shape), size=3)].ravel()
     while (peak != peak[peak]).any():
         peak = peak[peak]
     height = density.ravel()[peak].reshape(density.shape)

@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from viz_estim.core import quaternions
 from viz_estim.core.beliefs import Gaussian
@@ -132,7 +132,7 @@ def start(X: Array, max_distance: float) -> Gaussian:
     return Gaussian(space, to_state(np.eye(d), np.zeros(d)), np.diag(std**2))
 
 
-def nearest(points: Array, tree: cKDTree, max_distance: float) -> Matches:
+def nearest(points: Array, tree: scipy.spatial.cKDTree, max_distance: float) -> Matches:
     """Each of the points (N, d) that has one of the tree's within max_distance (m), with the nearest."""
     # The tree takes its bound as excluded.
     distance, index = tree.query(points, distance_upper_bound=np.nextafter(max_distance, np.inf))
@@ -167,7 +167,7 @@ class ClosestPoints:
 
     def __init__(self, X: Array, Y: Array, max_distance: float) -> None:
         self.X, self.max_distance = X, max_distance
-        self._tree = cKDTree(Y)
+        self._tree = scipy.spatial.cKDTree(Y)
         self._last: tuple[Array, Matches] | None = None
 
     def step(self, belief: Gaussian, tick: Tick, rng: np.random.Generator) -> Iterator[Stage]:

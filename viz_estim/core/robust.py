@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy
 
 from viz_estim.core.quaternions import Array
 
@@ -23,7 +23,7 @@ def solve(
     x, scale = start, 1.0
     for _ in range(3):  # the scale follows the residuals
         scale = max(1.5 * typical(residual(x)), 1e-9)
-        x = least_squares(residual, x, jacobian, loss="soft_l1", f_scale=scale, x_scale="jac").x
+        x = scipy.optimize.least_squares(residual, x, jacobian, loss="soft_l1", f_scale=scale, x_scale="jac").x
     r, J = residual(x), jacobian(x)
     z = 1.0 + (r / scale) ** 2
     H = J.T @ (J * z[:, None] ** -1.5)  # soft-L1 has ρ' = z^(-1/2) and ρ' + 2ρ''r²/scale² = z^(-3/2)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from viz_estim.core.consistency import squared_distance
 from viz_estim.core.distributions import binom, chi2, norm
@@ -182,7 +182,7 @@ def factor_on_noise(readings: Readings) -> float | None:
 
     low, high = np.log(1e-4), np.log(1e6)
     try:
-        return float(np.exp(brentq(excess, low, high, xtol=1e-3)))
+        return float(np.exp(scipy.optimize.brentq(excess, low, high, xtol=1e-3)))
     except ValueError:
         return None
 

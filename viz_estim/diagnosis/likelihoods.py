@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from itertools import islice, permutations
 
 import numpy as np
+import scipy
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean, Space
@@ -97,7 +98,6 @@ def _of_positions(p: Array, logs: Array, z: Array) -> float | None:
 
 def _of_distances(p: Array, logs: Array, z: Array, truth: Array) -> tuple[Array, Array] | None:
     """Places (s, d) and σ² (s,) of s distances."""
-    from scipy.optimize import least_squares  # here: it takes a while to import
 
     steps = np.linspace(0, len(p) - 1, _STEPS).astype(int)
     some = np.linspace(0, p.shape[1] - 1, min(_PARTICLES, p.shape[1])).astype(int)
@@ -128,7 +128,7 @@ def _of_distances(p: Array, logs: Array, z: Array, truth: Array) -> tuple[Array,
 
     for places in islice(_starts(truth, z, steps), _STARTS):
         start = np.concatenate([places.ravel(), np.zeros(s)])
-        fit = least_squares(missed, start, slopes, method="lm", max_nfev=_ROUNDS)
+        fit = scipy.optimize.least_squares(missed, start, slopes, method="lm", max_nfev=_ROUNDS)
         if np.sqrt(np.mean(fit.fun**2)) < _EXACT:
             return fit.x[: s * d].reshape(s, d), np.exp(-fit.x[s * d :])
     return None

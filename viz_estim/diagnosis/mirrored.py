@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from viz_estim.core.distributions import binom
 from viz_estim.core.quaternions import Array
@@ -61,7 +61,7 @@ def mirrored(case: Case) -> Iterator[Finding]:
     if found is None or not np.isfinite(truth).all():
         return
     X, Y, last = found
-    tree, d = cKDTree(Y), X.shape[1]
+    tree, d = scipy.spatial.cKDTree(Y), X.shape[1]
     own, _ = tree.query(moved(truth, X))
     tried = [(tree.query(moved(truth, X @ A.T))[0], title) for title, A in maps(d, "m") if title.startswith("axes")]
     best, what = min(tried, key=lambda one: float(np.median(one[0])))

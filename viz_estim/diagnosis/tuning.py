@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from viz_estim.core.consistency import squared_distance
 from viz_estim.core.distributions import chi2
@@ -156,7 +156,7 @@ def _peak(scores: Array, grid: Array) -> tuple[float, float]:
 def _spline(scores: Array, grid: Array) -> tuple[Array, Array]:
     """Log factors, forty to each step of the grid, and a cubic spline through the grid's scores there."""
     fine = np.linspace(grid[0], grid[-1], 40 * (len(grid) - 1) + 1)
-    return fine, np.asarray(CubicSpline(grid, np.nan_to_num(scores, nan=-1e300, neginf=-1e300))(fine))
+    return fine, np.asarray(scipy.interpolate.CubicSpline(grid, np.nan_to_num(scores, nan=-1e300, neginf=-1e300))(fine))
 
 
 def _scores(

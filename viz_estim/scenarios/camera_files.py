@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import scipy.io
+import scipy
 
 from viz_estim.core.panoramas import Picture
 from viz_estim.core.quaternions import Array

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
+import scipy
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import wrap

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
+import scipy
 
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
@@ -106,7 +106,7 @@ def evened(stamps: Array) -> Array:
     if len(stamps) > _FRAMES:
         inner, frame = slice(half, -half), float(np.median(np.diff(stamps)))
         whole = np.abs(stamps[2 * half :] - stamps[: -2 * half] - 2 * half * frame) < 3 * frame
-        out[inner] = np.where(whole, uniform_filter1d(stamps, _FRAMES)[inner], stamps[inner])
+        out[inner] = np.where(whole, scipy.ndimage.uniform_filter1d(stamps, _FRAMES)[inner], stamps[inner])
     return np.maximum.accumulate(out)
 
 

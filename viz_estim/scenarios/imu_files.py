@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
+import scipy
 
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array

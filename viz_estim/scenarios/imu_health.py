@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
+import scipy
 
 from viz_estim.core import quaternions
 from viz_estim.core.distributions import chi2, norm, t
@@ -76,7 +76,7 @@ def _still(stamps: Array, gyro: Array, accel: Array) -> int:
             return 0
         # Of T means over the window, six channels, on both sides.
         bound = _bound(values[:n], width, drift, 2 * _CHANNELS * len(stamps))
-        moved = (np.abs(uniform_filter1d(values, width, axis=0, mode="nearest") - base) > bound).any(1)
+        moved = (np.abs(scipy.ndimage.uniform_filter1d(values, width, axis=0, mode="nearest") - base) > bound).any(1)
         if moved.any():
             end = min(end, int(np.argmax(moved)) - width // 2)
     return end if end >= n else 0
@@ -138,11 +138,11 @@ def flat_runs(stamps: Array, values: Array) -> list[tuple[int, int]]:
     if width < 3 or width >= len(stamps):
         return []
     quantum = np.array([_quantum(channel) for channel in values.T])
-    span = maximum_filter1d(values, width, axis=0) - minimum_filter1d(values, width, axis=0)
+    span = scipy.ndimage.maximum_filter1d(values, width, axis=0) - scipy.ndimage.minimum_filter1d(values, width, axis=0)
     centres = (span <= 2.01 * quantum).all(1)
     # The windows at the two ends would lean on samples mirrored in; the flat runs are the union of the flat windows.
     centres[: width // 2] = centres[-(width // 2) :] = False
-    flat = maximum_filter1d(centres, width)
+    flat = scipy.ndimage.maximum_filter1d(centres, width)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]])))
     # Two flat runs may touch, where a stuck sensor comes to itself at rest: the jump between them parts them.
     jumps = np.flatnonzero((np.abs(np.diff(values, axis=0)) > 2.01 * quantum).any(1)) + 1
@@ -197,7 +197,7 @@ def _missed_turn(stamps: Array, rate: Array, accel: Array, tests: int) -> tuple[
     half = width // 2
     if len(stamps) <= 3 * width:
         return 0.0, 0.0
-    seen = uniform_filter1d(accel, width, axis=0)[half:-half]
+    seen = scipy.ndimage.uniform_filter1d(accel, width, axis=0)[half:-half]
     length = np.maximum(np.linalg.norm(seen, axis=1, keepdims=True), 1e-9)
     white = np.sqrt(0.5 * np.square(np.diff(accel, axis=0)).mean(0).max() / width) / float(length.mean())
     seen = seen / length

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
 
 from viz_estim.core.beliefs import Gaussian
 from viz_estim.core.kalman import KalmanFilter
@@ -80,9 +81,7 @@ def simulate(rng: np.random.Generator, observations: int, a: float = _TRUE_A) ->
     """Observations y₀, y₁, … of the model, from an x₀ of its own."""
     steps = _PROCESS_STD * rng.standard_normal(observations)
     steps[0] = _START_MEAN + math.sqrt(_START_VARIANCE) * rng.standard_normal()
-    from scipy.signal import lfilter  # here: it takes a second to import
-
-    x = lfilter([1.0], [1.0, -a], steps)
+    x = scipy.signal.lfilter([1.0], [1.0, -a], steps)
     y = np.sqrt(x**2 + 1) + _READING_STD * rng.standard_normal(observations)
     return ParameterData(y, np.stack([x, np.full(observations, a)], axis=-1))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.optimize
+import scipy
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import wrap

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import make_lsq_spline
+import scipy
 
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
@@ -89,6 +89,6 @@ def smooth_path(stamps: Array, pose: Array) -> Array:
     inner = np.unique(stamps[np.searchsorted(stamps, np.arange(*ends, _KNOTS))]) if ends[1] > ends[0] else stamps[:0]
     knots = np.concatenate([np.repeat(stamps[0], _DEGREE + 1), inner, np.repeat(stamps[-1], _DEGREE + 1)])
     pose = np.concatenate([pose[:, :3], quaternions.continuous(pose[:, 3:])], axis=1)
-    path = make_lsq_spline(stamps, pose, knots, _DEGREE)
+    path = scipy.interpolate.make_lsq_spline(stamps, pose, knots, _DEGREE)
     at = path(stamps)
     return np.concatenate([at[:, :3], quaternions.normalise(at[:, 3:]), path(stamps, 1)[:, :3]], axis=1)
