@@ -162,16 +162,22 @@ def _spline(scores: Array, grid: Array) -> tuple[Array, Array]:
 def _scores(
     case: Case, moves: dict[str, Array], updates: dict[str, StageTable], scale: dict[str, Array], B: int
 ) -> Array | None:
-    """The log-likelihood (B,) of the innovations under each pair of factors."""
+    """The log-likelihood (B,) of the innovations under each set of factors, B at once.
+
+    An update is one number after the other, of readings turned so that their noises are independent (Bierman 1977,
+    chapter II): no matrix is inverted.
+    """
     run, space = case.run, case.space
     before = {name: case.sequence.before(run.stages[name])[1] for name in (*moves, *updates)}
-    H = {name: jacobians(before[name], table.values["innovation.cross_cov"]) for name, table in updates.items()}
     noise = {name: _noise(run.stages[name], F, before[name]) for name, F in moves.items()}
+    turned = {name: _turned(case, table, before[name]) for name, table in updates.items()}
+    noises = {
+        name: t.noise[:, :, None] * np.array([scale[sensor] for sensor in t.sensors]) for name, t in turned.items()
+    }
     first = next((k for k, s in enumerate(case.sequence.stage) if s and s[0].step[s[1]] >= case.first), 0)
     carried = {name: _carried(case, table) for name, table in updates.items()}
     d, score = len(space.axes), np.zeros(B)
-    x, P = np.zeros((B, d)), None
-    known = {name: {int(s) for s in readings.step} for name, readings in case.sensors.items()}
+    x, P = np.zeros((d, B)), None  # P (d, d, B)
     skipped = _outlying(case, updates)
     for stage in case.sequence.stage[first : first + _PLACES]:
         if stage is None:
@@ -180,36 +186,66 @@ def _scores(
         name = table.name
         if name in moves and P is not None:
             F = moves[name][row]
-            x, P = x @ F.T, F @ P @ F.T + scale["Q"][:, None, None] * noise[name][row]
+            x, P = F @ x, _mapped(P, F) + noise[name][row][:, :, None] * scale["Q"]
         elif name in updates and P is not None:
-            get = table.values
-            h, nu, K = H[name][row], get["innovation.residual"][row], get["gain"][row]
-            R = np.repeat(get["innovation.noise"][row][None], B, axis=0)
-            on = np.ones(len(nu), bool)
-            for (part, axes), offered, used in zip(
-                _parts(table).items(), get["innovation.offered"][row], get["innovation.used"][row], strict=True
-            ):
-                sensor = part.partition("/")[0]
-                R[:, axes, axes] *= scale[sensor][:, None, None]
-                on[axes] = bool(offered and used and int(table.step[row]) in known.get(sensor, ()))
-            if not on.any() or not np.isfinite(h).all() or not np.isfinite(nu).all():
-                x = x - K @ np.nan_to_num(nu) if np.isfinite(K).all() else x
+            nu, K = table.values["innovation.residual"][row], table.values["gain"][row]
+            readings = turned[name]
+            on = np.flatnonzero(readings.on[row])
+            if not len(on) or not np.isfinite(readings.H[row]).all() or not np.isfinite(nu).all():
+                x = x - (K @ np.nan_to_num(nu))[:, None] if np.isfinite(K).all() else x
                 continue
-            h, v, S = h[on], nu[on] - x @ h[on].T, h[on] @ P @ h[on].T + R[:, on][:, :, on]
-            S = 0.5 * (S + np.swapaxes(S, 1, 2))
-            inverse, C = np.linalg.inv(S), P @ h[on].T
-            gain = C @ inverse
+            v, S = np.empty((2, len(on), B))
+            x, P = x.copy(), P.copy()
+            for k, i in enumerate(on):
+                h = readings.H[row, i]
+                C = (h @ P.reshape(d, d * B)).reshape(d, B)
+                S[k] = h @ C + noises[name][row, i]
+                v[k] = readings.residual[row, i] - h @ x
+                gain = C / S[k]
+                x += gain * v[k]
+                P -= gain[:, None] * C
             if (name, row) not in skipped:
-                score -= 0.5 * (np.einsum("bi,bij,bj->b", v, inverse, v) + np.linalg.slogdet(S)[1])
-            x = x + np.einsum("bdm,bm->bd", gain, v) - K @ nu
-            P = P - gain @ np.swapaxes(C, 1, 2)
+                score -= 0.5 * (v * v / S + np.log(S)).sum(0)
+            x -= (K @ nu)[:, None]
             if not space.flat:
                 T = carried[name][row]
-                x, P = x @ T.T, T @ P @ T.T
-            P = 0.5 * (P + np.swapaxes(P, 1, 2))
+                x, P = T @ x, _mapped(P, T)
         elif np.isfinite(table.cov[row]).all():
-            x, P = np.zeros((B, d)), np.repeat(table.cov[row][None], B, axis=0)
+            x, P = np.zeros((d, B)), np.repeat(table.cov[row][:, :, None], B, axis=2)
     return score if P is not None and np.isfinite(score).any() else None
+
+
+class _Turned(NamedTuple):
+    """An update's readings in M rows, each sensor's m numbers turned so that their noises are independent."""
+
+    H: Array  # (M, m, d)
+    residual: Array  # (M, m)
+    noise: Array  # (M, m), variances
+    on: np.ndarray  # (M, m), whether the reading was used
+    sensors: list[str]  # m
+
+
+def _turned(case: Case, table: StageTable, before: Array) -> _Turned:
+    get = table.values
+    H, residual = jacobians(before, get["innovation.cross_cov"]).copy(), get["innovation.residual"].copy()
+    noise, on, sensors = np.empty_like(residual), np.zeros(residual.shape, bool), []
+    for i, (part, axes) in enumerate(_parts(table).items()):
+        sensor = part.partition("/")[0]
+        sensors += [sensor] * (axes.stop - axes.start)
+        R = get["innovation.noise"][:, axes, axes]
+        noise[:, axes], axis = np.linalg.eigh(np.nan_to_num(R))
+        noise[~np.isfinite(R).all((1, 2)), axes] = np.nan
+        H[:, axes] = np.swapaxes(axis, 1, 2) @ H[:, axes]
+        residual[:, axes] = (np.swapaxes(axis, 1, 2) @ residual[:, axes, None])[..., 0]
+        known = np.isin(table.step, case.sensors[sensor].step) if sensor in case.sensors else np.zeros(len(on), bool)
+        on[:, axes] = (get["innovation.offered"][:, i] * get["innovation.used"][:, i] * known > 0)[:, None]
+    return _Turned(H, residual, noise, on, sensors)
+
+
+def _mapped(P: Array, A: Array) -> Array:
+    """A·P·Aᵀ of symmetric P (d, d, B), by two products of all at once."""
+    half = (A @ P.reshape(len(A), -1)).reshape(P.shape)
+    return (A @ np.swapaxes(half, 0, 1).reshape(len(A), -1)).reshape(P.shape)
 
 
 def _carried(case: Case, table: StageTable) -> Array:
