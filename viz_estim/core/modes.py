@@ -41,11 +41,17 @@ def moments(space: Space, states: Array, log_weights: Array) -> tuple[Array, Arr
     else:  # one number spread over all particles: its exponential is taken once, and the first is as heavy as any
         weights = np.ascontiguousarray(np.broadcast_to(np.exp(log_weights[..., :1]), log_weights.shape))[..., None]
         mean = states[..., :1, :]
+    angles = [i for i, unit in enumerate(space.units) if unit == "rad"]
     for rounds in range(_ROUNDS):
         error = space.minus(states, mean)
         across = np.swapaxes(error, -1, -2)
         step = np.swapaxes(across @ weights, -1, -2)
         mean = space.plus(mean, step)
+        if space.flat:  # the errors at the new mean are known, unless one of them passes the half turn
+            error -= step
+            if all(np.abs(error[..., i]).max() < np.pi for i in angles):
+                break
+            continue
         left = float(np.abs(step).max())
         if left < 1e-10 or (rounds > 1 and left < 64 * _EPS * float(np.abs(states).max())):
             break

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from viz_estim.core.consistency import squared_distance
 from viz_estim.core.distributions import binom, chi2
 from viz_estim.core.modes import moments, several
 from viz_estim.core.quaternions import Array
@@ -155,12 +154,12 @@ def _hollow(space: Space, states: Array, log_weights: Array) -> float:
     """The chance of so little weight about the mean of a normal cloud."""
     mean, cov = moments(space, states, log_weights)
     try:
-        far = squared_distance(space.minus(states, mean), np.broadcast_to(cov, (len(states), *cov.shape)))
+        whitened = np.linalg.solve(np.linalg.cholesky(cov), space.minus(states, mean).T)
     except np.linalg.LinAlgError:
         return 1.0
     weights = np.exp(log_weights)
     n = 1 / float(weights @ weights)
-    inside = float(weights @ (far < chi2.ppf(_NEAR, cov.shape[-1])))
+    inside = float(weights @ ((whitened**2).sum(0) < chi2.ppf(_NEAR, cov.shape[-1])))
     return float(binom.cdf(np.round(n * inside), np.round(n), _NEAR))
 
 
