@@ -211,9 +211,8 @@ class S2:
     def basis(self, x: Array) -> Array:
         """Two orthonormal tangents at x, as rows (*, 2, 3); the first leans to the x axis, or to y where x is near."""
         reference = np.where(np.abs(x[..., :1]) < 0.9, _X, _Y)
-        first = reference - np.einsum("...i,...i->...", reference, x)[..., None] * x
-        first = quaternions.normalise(first)
-        return np.stack([first, quaternions.cross(x, first)], axis=-2)
+        first = quaternions.normalise(reference - np.vecdot(reference, x)[..., None] * x)
+        return np.concatenate([first[..., None, :], quaternions.cross(x, first)[..., None, :]], axis=-2)
 
     def plus(self, x: Array, delta: Array) -> Array:
         return self._exp(x, (delta[..., None, :] @ self.basis(x))[..., 0, :])
@@ -241,13 +240,13 @@ class S2:
 
     def _log(self, y: Array, x: Array) -> Array:
         """The tangent vector (*, 3) at x that leads to y."""
-        cosine = np.einsum("...i,...i->...", x, y)[..., None]
+        cosine = np.vecdot(x, y)[..., None]
         across = y - cosine * x
         sine = quaternions.length(across)
-        # Exactly opposite, every way there is as long: the first tangent's is taken.
-        opposite = (sine < 1e-12) & (cosine < 0)
-        across = np.where(opposite, self.basis(x)[..., 0, :], across) if opposite.any() else across
-        return np.arctan2(sine, cosine) / np.where(opposite, 1.0, sine + 1e-200) * across
+        size, opposite = sine + 1e-200, (sine < 1e-12) & (cosine < 0)
+        if opposite.any():  # every way there is as long: the first tangent's is taken
+            across, size = np.where(opposite, self.basis(x)[..., 0, :], across), np.where(opposite, 1.0, size)
+        return np.arctan2(sine, cosine) / size * across
 
 
 class Product:
