@@ -221,7 +221,7 @@ def no_bias_state(data: PlazaData) -> Scenario:
 def clamped_particles(data: BeaconData) -> Scenario:
     """Particles that leave the area are put back on its edge."""
     low, high = np.array([0.0, 0.0, -np.inf]), np.array([*beacons.BEACONS[1] - [3.0, 0.0], np.inf])
-    return broken(beacons.beacons_pf(data), lambda f: flawed_filters.Clamping(f, low, high))
+    return broken(beacons.beacons_pf(data, particles=400), lambda f: flawed_filters.Clamping(f, low, high))
 
 
 @flaw("particles_collapsed", beacons)

@@ -33,7 +33,7 @@ def doubled_ranges(data: LandmarksData) -> Scenario:
 @flaw("units_or_axes", beacons)
 def exchanged_beacons(data: BeaconData) -> Scenario:
     """The particles' range to one beacon is taken for that to the other."""
-    return beacons.beacons_pf(replace(data, log=replace(data.log, ranges=data.log.ranges[:, ::-1])))
+    return beacons.beacons_pf(replace(data, log=replace(data.log, ranges=data.log.ranges[:, ::-1])), particles=400)
 
 
 @flaw("units_or_axes", beacons)
@@ -42,19 +42,21 @@ def misplaced_beacon(data: BeaconData) -> Scenario:
     known, true = data.log.truth[:, :2], beacons.BEACONS[1] - [4.0, 0.0]
     off = np.linalg.norm(known - true, axis=1) - np.linalg.norm(known - beacons.BEACONS[1], axis=1)
     ranges = np.stack([data.log.ranges[:, 0], data.log.ranges[:, 1] + off], axis=-1)
-    return beacons.beacons_pf(replace(data, log=replace(data.log, ranges=ranges)))
+    return beacons.beacons_pf(replace(data, log=replace(data.log, ranges=ranges)), particles=400)
 
 
 @flaw("lag", beacons)
 def late_ranges(data: BeaconData) -> Scenario:
     """The ranges come half a second late."""
-    return shifted(beacons.beacons_pf(data), 5)
+    return shifted(beacons.beacons_pf(data, particles=400), 5)
 
 
 @flaw("biased_innovation", beacons)
 def long_ranges(data: BeaconData) -> Scenario:
     """The first beacon's ranges are 2 m too long."""
-    return beacons.beacons_pf(replace(data, log=replace(data.log, ranges=data.log.ranges + np.array([2.0, 0.0]))))
+    return beacons.beacons_pf(
+        replace(data, log=replace(data.log, ranges=data.log.ranges + np.array([2.0, 0.0]))), particles=400
+    )
 
 
 @flaw("process_model", diffdrive)
