@@ -101,6 +101,11 @@ def _why_nothing_draws() -> str | None:
     return None
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than there are cores: tests of the viewer and of other processes wait for them."""
+    return len(os.sched_getaffinity(0)) + 1
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long tests begin first: begun last, one would keep a single worker busy when all others have ended."""
     items.sort(key=lambda item: item.get_closest_marker("long") is None)

@@ -125,21 +125,16 @@ def test_an_approximate_scenario_raises_only_the_codes_that_it_states(name: str)
     assert {finding.code for finding in found} <= APPROXIMATE[name], found
 
 
-@pytest.fixture(scope="module")
-def calibration(real_data: Path, cli: Cli, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("calibration") / "imu.json"
-    assert cli("calibrate", "imu", "--data", real_data / "ese650", "--out", path).code == 0
-    return path
-
-
-@pytest.mark.parametrize(("number", "interval"), [(1, (8.57, 9.83)), (2, (8.55, 10.07)), (3, None)])
+@pytest.mark.parametrize(
+    ("number", "scenario", "interval"),
+    [(1, "imu-ukf", (8.57, 9.83)), (2, "imu-ukf", (8.55, 10.07)), (3, "imu-gyro", None)],
+)
 def test_the_gyro_s_freeze_is_found_in_the_real_sets(
-    number: int, interval: tuple[float, float] | None, real_data: Path, calibration: Path, cli: Cli, tmp_path: Path
+    number: int, scenario: str, interval: tuple[float, float] | None, real_data: Path, cli: Cli, tmp_path: Path
 ) -> None:
     path = tmp_path / "run.rrd"
     file = real_data / "ese650" / f"imuRaw{number}.mat"
-    options = ["--set", "initial=truth", "--calibration", calibration]
-    assert cli("run", "imu-ukf", "--data", file, *options, "--out", path).code == 0
+    assert cli("run", scenario, "--data", file, "--set", "initial=truth", "--out", path).code == 0
     done = cli("diagnose", path, "--json")
     findings = json.loads(done.out)["findings"]
     assert done.code == int(any(finding["severity"] == "error" for finding in findings))

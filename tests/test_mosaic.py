@@ -192,8 +192,9 @@ def test_similarity_is_the_psnr_over_solid_angle() -> None:
 
 def test_the_filter_is_as_it_is_without_a_camera(data: camera.CameraData) -> None:
     for by, alone in (("imu-gyro", imu.imu_gyro), ("imu-ukf-gyro", imu.imu_ukf_gyro)):
-        scenario = camera.mosaic(data, by=by, initial="accel")
-        for with_camera, without in zip(run(scenario), run(alone(data.imu)), strict=True):
+        with_it, without_it = camera.mosaic(data, by=by, initial="accel"), alone(data.imu)
+        pair = (replace(scenario, ticks=scenario.ticks[:250]) for scenario in (with_it, without_it))
+        for with_camera, without in zip(*map(run, pair), strict=True):
             stages = [stage for stage in with_camera.stages if not isinstance(stage, Paint)]
             assert [type(stage) for stage in stages] == [type(stage) for stage in without.stages]
             for mine, theirs in zip(stages, without.stages, strict=True):
@@ -217,7 +218,7 @@ def test_a_picture_lies_where_the_attitude_was_when_it_was_taken(data: camera.Ca
 
 
 def test_every_picture_within_the_data_is_painted_at_the_first_tick_after_it(data: camera.CameraData) -> None:
-    steps = list(run(camera.mosaic(data)))
+    steps = list(run(camera.mosaic(data, by="imu-gyro")))
     painted = [(step, stage) for step in steps for stage in step.stages if isinstance(stage, Paint)]
     assert [int(stage.picture[0]) for _, stage in painted] == list(range(len(data.stamps)))
     for step, stage in painted:
