@@ -103,7 +103,8 @@ def _why_nothing_draws() -> str | None:
 
 def pytest_xdist_auto_num_workers() -> int:
     """One more than there are cores: tests of the viewer and of other processes wait for them."""
-    return len(os.sched_getaffinity(0)) + 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return cores + 1
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

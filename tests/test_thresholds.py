@@ -172,7 +172,7 @@ def imu_run(change: Any, duration: float) -> list[Finding]:
 
 
 def test_a_gyro_s_sensitivity_is_told_by_how_gravity_turns() -> None:
-    first = imu_run(lambda rate: 1.25 * rate, 24.0)[0]
+    first = imu_run(lambda rate: 1.25 * rate, 14.0)[0]
     assert (first.code, first.sensor, first.severity) == ("units_or_axes", "gyro", "error")
     assert float(first.evidence["map"].removeprefix("a factor of ")) == pytest.approx(1.25, abs=0.06)
 
