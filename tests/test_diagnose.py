@@ -75,22 +75,23 @@ def drawn(scenario: Scenario, rng: np.random.Generator) -> Scenario:
     for k, tick in enumerate(scenario.ticks[first:]):
         tick = replace(tick, dt=tick.dt if k else 0.0, raw={}, faults={}, stand_ins={})
         x, readings = next_of(filter, start.space, x, tick, rng)
-        ticks.append(replace(tick, measurements={name: readings[name] for name in tick.measurements}))
+        ticks.append(replace(tick, measurements=readings))
         truth.append(x)
     return replace(scenario, beliefs={0: start}, ticks=ticks, truth=np.array(truth))
 
 
 def next_of(filter: Any, space: Any, x: Array, tick: Tick, rng: np.random.Generator) -> tuple[Array, dict[str, Array]]:
+    """The next state, and the tick's readings of it."""
     if not isinstance(filter, AugmentedFilter):
         x = filter.draw_state(space, x, tick, rng)
-        return x, filter.draw_readings(x, rng)
-    if tick.dt > 0:
+    elif tick.dt > 0:
         Q = filter.process_noise(tick)
         x = filter.process(x, rng.standard_normal(len(Q)) * np.sqrt(np.diag(Q)), tick)
     readings = {}
-    for name, sensor in filter.sensors.items():
-        expected = filter.expected[name](x, tick) if name in filter.expected else sensor.measure(x)
-        readings[name] = normal(sensor.space, expected, sensor.noise, rng)
+    for name in tick.measurements:
+        sensor, expected = getattr(filter, "measurement", filter).sensors[name], getattr(filter, "expected", {})
+        mean = expected[name](x, tick) if name in expected else sensor.measure(x)
+        readings[name] = normal(sensor.space, mean, sensor.noise, rng)
     return x, readings
 
 
