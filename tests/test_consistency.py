@@ -253,6 +253,6 @@ def test_the_filters_are_consistent_on_data_of_their_own_model(scenario: Callabl
 def test_a_noise_four_times_too_small_or_too_large_is_seen(
     scenario: Callable[..., Scenario], factors: dict[str, float], sensor: str
 ) -> None:
-    inside, steps, numbers = shares(scenario, count=400, **factors)  # steps are enough to see it
+    inside, steps, numbers = shares(scenario, count=250, **factors)  # steps are enough to see it
     assert inside[sensor] == 0, numbers
     assert steps < 0.1, numbers
