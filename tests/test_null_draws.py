@@ -13,6 +13,7 @@ from viz_estim.core.spaces import Euclidean, Product
 from viz_estim.diagnosis import clocks, confidence, errors, evidence, sensors, truth, weighing
 from viz_estim.diagnosis.finding import _FAMILIES, GROSS, times
 from viz_estim.diagnosis.fits import Against
+from viz_estim.diagnosis.outlying import outlying
 from viz_estim.scenarios.imu_health import GRAVITY, frozen_gyro, still_prefix
 
 SHARE = 0.05 / _FAMILIES  # of a check: warnings a run
@@ -115,11 +116,13 @@ def test_errors_that_follow_one_another_keep_to_the_share(rho: float) -> None:
 @pytest.mark.parametrize("dof", [1, 3])
 def test_outliers_are_set_apart_without_more_alarms_of_size_and_a_large_noise_has_none(dof: int) -> None:
     rng, draws = np.random.default_rng(17), 600
-    found = sum(confidence.size(rng.chisquare(dof, 200), dof)[1] < SHARE for _ in range(draws))
+    found = sum(confidence.size(rng.chisquare(dof, 200), dof, 1)[1] < SHARE for _ in range(draws))
     assert found <= draws * SHARE + 3 * (draws * SHARE) ** 0.5
-    assert not any(confidence._far(3 * rng.chisquare(dof, 400), dof).any() for _ in range(100))
+    for factor in (1.0, 1.5, 3.0):  # also of a noise that is too small
+        alarms = sum(outlying(factor * rng.chisquare(dof, 400), dof, 1).far.any() for _ in range(draws))
+        assert alarms <= draws * SHARE + 3 * (draws * SHARE) ** 0.5
     glitches = np.append(rng.chisquare(dof, 400), [60.0] * 8)
-    assert confidence._far(glitches, dof)[-8:].all()
+    assert outlying(glitches, dof, 1).far[-8:].all()
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.02, 0.1])

@@ -14,11 +14,11 @@ from viz_estim.core.distributions import binom, chi2
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
 from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
 from viz_estim.diagnosis.innovations import gate_name
+from viz_estim.diagnosis.outlying import outlying
 
 # What a gate may refuse whatever it is set to: 0.95 is the narrowest in use, and to throw away one good reading of
 # twenty makes a variance larger by as much.
 _REFUSED = 0.05
-_TAIL = 1e-3
 
 
 def gates(case: Case) -> Iterator[Finding]:
@@ -92,11 +92,10 @@ def _wide(case: Case, readings: Readings, g: float) -> Iterator[Finding]:
             f"refuse where νᵀS⁻¹ν > χ².ppf({g:g}, {dof}): the square, with {name}'s own S and number of components",
         )  # fmt: skip
         return
-    scale = max(1.0, float(np.median(readings.nis)) / chi2.median(dof))
-    far = readings.used & (readings.nis / scale > chi2.isf(_TAIL, dof))
-    p_far, p_few = float(binom.sf(far.sum() - 1, N, _TAIL)), float(binom.cdf(refused, N, 1 - g))
+    far, _, p_far = outlying(readings.nis[readings.used], dof, 2 * len(case.sensors))
+    p_few = float(binom.cdf(refused, N, 1 - g))
     if severity := judge(p_far, 4 * len(case.sensors), large=False):
-        rows = np.flatnonzero(far)
+        rows = np.flatnonzero(readings.used)[far]
         steps = int(readings.step[rows[0]]), int(readings.step[rows[-1]])
         evidence = {"passed": len(rows), "refused": refused, "readings": N, "p": p_far}
         yield Finding(

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from viz_estim.core.consistency import squared_distance
 from viz_estim.core.distributions import chi2
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.evidence import Case, jacobians, once, tells_gain, transitions
+from viz_estim.diagnosis.outlying import outlying
 from viz_estim.recording.tables import StageTable
 
 _GRID = np.arange(-6.0, 6.5) * np.log(10) / 2  # log factors, 10⁻³ to 10³
@@ -171,8 +171,11 @@ def _scores(
     carried = {name: _carried(case, table) for name, table in updates.items()}
     d, score = len(space.axes), np.zeros(B)
     x, P = np.zeros((B, d)), None
-    known = {name: {int(s) for s in readings.step} for name, readings in case.sensors.items()}
-    skipped = _outlying(case, updates)
+    # As with a gate: an outlier that moved the estimate would make what comes after it a matter of Q.
+    known = {
+        name: {int(s) for s in r.step[~outlying(r.nis, r.dof, len(case.sensors)).far]}
+        for name, r in case.sensors.items()
+    }
     for stage in case.sequence.stage[first : first + _PLACES]:
         if stage is None:
             continue
@@ -192,17 +195,16 @@ def _scores(
                 sensor = part.partition("/")[0]
                 R[:, axes, axes] *= scale[sensor][:, None, None]
                 on[axes] = bool(offered and used and int(table.step[row]) in known.get(sensor, ()))
-            if not on.any() or not np.isfinite(h).all() or not np.isfinite(nu).all():
-                x = x - K @ np.nan_to_num(nu) if np.isfinite(K).all() else x
-                continue
-            h, v, S = h[on], nu[on] - x @ h[on].T, h[on] @ P @ h[on].T + R[:, on][:, :, on]
-            S = 0.5 * (S + np.swapaxes(S, 1, 2))
-            inverse, C = np.linalg.inv(S), P @ h[on].T
-            gain = C @ inverse
-            if (name, row) not in skipped:
+            if on.any() and np.isfinite(h).all() and np.isfinite(nu).all():
+                h, v = h[on], nu[on] - x @ h[on].T
+                S = h @ P @ h.T + R[:, on][:, :, on]
+                S = 0.5 * (S + np.swapaxes(S, 1, 2))
+                inverse, C = np.linalg.inv(S), P @ h.T
+                gain = C @ inverse
                 score -= 0.5 * (np.einsum("bi,bij,bj->b", v, inverse, v) + np.linalg.slogdet(S)[1])
-            x = x + np.einsum("bdm,bm->bd", gain, v) - K @ nu
-            P = P - gain @ np.swapaxes(C, 1, 2)
+                x = x + np.einsum("bdm,bm->bd", gain, v)
+                P = P - gain @ np.swapaxes(C, 1, 2)
+            x = x - np.nan_to_num(K) @ np.nan_to_num(nu)
             if not space.flat:
                 T = carried[name][row]
                 x, P = x @ T.T, T @ P @ T.T
@@ -226,17 +228,3 @@ def _noise(table: StageTable, F: Array, before: Array) -> Array:
     Q = np.nan_to_num(0.5 * (Q + np.swapaxes(Q, 1, 2)))
     values, vectors = np.linalg.eigh(Q)
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2))
-
-
-def _outlying(case: Case, updates: dict[str, StageTable]) -> set[tuple[str, int]]:
-    """The updates, by stage and row, with a reading beyond χ²'s quantile of 1 − 10⁻³, as long as these are few: a
-    matter of outliers, not of a noise."""
-    found: set[tuple[str, int]] = set()
-    for name, table in updates.items():
-        get = table.values
-        for axes in _parts(table).values():
-            nis = squared_distance(get["innovation.residual"][:, axes], get["innovation.cov"][:, axes, axes])
-            far = nis > chi2.isf(1e-3, axes.stop - axes.start)
-            if far.mean() <= 0.05:
-                found |= {(name, int(row)) for row in np.flatnonzero(far)}
-    return found
