@@ -89,7 +89,11 @@ def _by_process(case: Case) -> Iterator[Finding]:
     It tells a wrong Q from innovations whose size is right and whose order is not. Only looked at where innovations
     look odd at the level of 0.05, by their size or by Ljung and Box, which can but lower its false alarms.
     """
-    looks = [min(size(r.nis, r.dof, len(case.sensors))[1], ljung_box(r)) for r in case.sensors.values() if len(r) >= 2 * _FEWEST]
+    looks = [
+        min(size(r.nis, r.dof, len(case.sensors))[1], ljung_box(r))
+        for r in case.sensors.values()
+        if len(r) >= 2 * _FEWEST
+    ]
     if not looks or min(looks) > 0.05:
         return
     tuned = tuning.factors(case)

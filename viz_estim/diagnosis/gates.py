@@ -12,29 +12,25 @@ import numpy as np
 
 from viz_estim.core.distributions import binom, chi2
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
+from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, judge, level
 from viz_estim.diagnosis.innovations import gate_name
 from viz_estim.diagnosis.outlying import outlying
-
-# What a gate may refuse whatever it is set to: 0.95 is the narrowest in use, and to throw away one good reading of
-# twenty makes a variance larger by as much.
-_REFUSED = 0.05
 
 
 def gates(case: Case) -> Iterator[Finding]:
     """A gate that refuses too many, is locked out, refuses fewer than it says, or none where there are outliers.
 
-    Too many: more than Binomial(N, 0.05) lets it. An error where half of the readings are lost for sure, for then the
-    variance that they leave is larger by GROSS. Locked out: so long a row of refusals, to the end, as comes by chance
-    with N·qⁿ, q = 1 − g where that is known, and at least 0.05.
+    Too many: surely more than the share SHEET, for to throw away so many makes a variance larger by it. An error where
+    half of the readings are lost for sure, for then the variance that they leave is larger by GROSS. Locked out: so
+    long a row of refusals, to the end, as comes by chance with N·qⁿ, q = 1 − g where that is known, and at least SHEET.
     """
     for name, readings in case.sensors.items():
         refused = ~readings.used
         N, count, stated = len(readings), int(refused.sum()), _stated(case, readings)
         if count:
             first, length = _longest(refused)
-            q = max(1 - stated if stated else 0.0, _REFUSED)
-            p = float(binom.sf(count - 1, N, _REFUSED))
+            q = max(1 - stated if stated else 0.0, SHEET)
+            p = float(binom.sf(count - 1, N, SHEET))
             p_row = min(1.0, N * q**length) if first + length == N else 1.0
             locked = p_row < level("error", 4 * len(case.sensors))
             p_half = float(binom.sf(count - 1, N, 1 - 1 / GROSS))
@@ -64,7 +60,7 @@ def _narrow(case: Case, name: str, how: str, step: int, locked: bool, q: float) 
             f"{how}, and from step {step} on all of them: the estimate has left, and can't come back",
             f"set {gate}=none to see what is refused; raise the noises that are too small, then gate again",
         )
-    if q > _REFUSED:
+    if q > SHEET:
         return (
             f"{how}: it is set to pass no more than {1 - q:.2g} of the good ones",
             f"set {gate}=0.999: a gate is there for readings that the noise can't explain",
