@@ -125,15 +125,31 @@ def test_outliers_are_set_apart_without_more_alarms_of_size_and_a_large_noise_ha
     assert outlying(glitches, dof, 1).far[-8:].all()
 
 
-@pytest.mark.parametrize("lost", [0.0, 0.02, 0.1])
-def test_readings_lost_by_chance_are_no_silence(lost: float) -> None:
+@pytest.mark.parametrize(("lost", "longest"), [(0.0, 1), (0.02, 1), (0.3, 1), (0.02, 7)])
+def test_readings_lost_by_chance_are_no_silence(lost: float, longest: int) -> None:
+    """longest: of the sensor's own intervals, in steps; the shortest is half of it."""
     rng, draws, found = np.random.default_rng(18), 300, 0
     for _ in range(draws):
-        z = np.where((rng.random(600) < lost)[:, None], np.nan, rng.standard_normal((600, 1)))
+        at = np.cumsum(rng.integers(max(1, longest // 2), longest + 1, 600))
+        at = at[(at < 600) & (rng.random(600) >= lost)]
+        z = np.full((600, 1), np.nan)
+        z[at] = rng.standard_normal((len(at), 1))
         of = case_of(np.zeros((600, 1))).run
         of = replace(of, inputs={"z.range": z}, step=np.arange(600), time=0.1 * np.arange(600))
         found += bool(list(sensors.silent(of)))
     assert found <= draws * SHARE + 3 * (draws * SHARE) ** 0.5
+
+
+@pytest.mark.parametrize("kind", ["sine", "noise", "both"])
+def test_a_smooth_signal_or_noise_in_counts_is_not_saturated(kind: str) -> None:
+    rng, t = np.random.default_rng(19), 0.01 * np.arange(3000)
+    for _ in range(30):
+        smooth = 10 * np.sin(rng.uniform(0.1, 3.0) * t + rng.uniform(0, 6))
+        z = (kind != "noise") * smooth + (kind != "sine") * rng.standard_normal(3000)
+        count = rng.choice([0.02, 0.1, 0.3])
+        of = case_of(np.zeros((10, 1))).run
+        of = replace(of, inputs={"z.range": count * np.round(z / count)[:, None]}, step=np.arange(3000), time=t)
+        assert not list(sensors.saturated(of))
 
 
 def test_a_factor_near_one_keeps_three_digits() -> None:
