@@ -12,7 +12,7 @@ import numpy as np
 
 from viz_estim.core.distributions import binom, chi2
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, judge, level
+from viz_estim.diagnosis.finding import GROSS, HALF_THE_DIGITS, SHEET, Finding, judge, level
 from viz_estim.diagnosis.innovations import gate_name
 from viz_estim.diagnosis.outlying import outlying
 
@@ -77,7 +77,7 @@ def _wide(case: Case, readings: Readings, g: float) -> Iterator[Finding]:
     name, dof, N = readings.name, readings.dof, len(readings)
     refused, gate = int((~readings.used).sum()), gate_name(case, readings.name)
     # Of the same numbers, of which a solve may lose half of the digits, and no more.
-    passed = readings.used & (readings.nis > chi2.ppf(g, dof) * (1 + np.sqrt(np.finfo(float).eps)))
+    passed = readings.used & (readings.nis > chi2.ppf(g, dof) * (1 + HALF_THE_DIGITS))
     if passed.any():
         rows = np.flatnonzero(passed)
         yield Finding(

@@ -12,12 +12,12 @@ from viz_estim.core.distributions import chi2, f, norm, t
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
 from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
+from viz_estim.diagnosis.fits import STRETCHES
 from viz_estim.diagnosis.icp import is_registration
 from viz_estim.diagnosis.outlying import TAIL, outlying
 
 _FEWEST = 20
 _LAGS = 10
-_STRETCHES = 20
 # The correlation ρ of neighbours in a first-order process whose mean has a variance larger by GROSS, (1 + ρ)/(1 − ρ).
 _CORRELATED = (GROSS - 1) / (GROSS + 1)
 
@@ -43,7 +43,7 @@ def biased(case: Case) -> Iterator[Finding]:
             if error <= 0:
                 continue
             score = mean / error
-            stretches = np.array([piece.mean() for piece in np.array_split(values, min(_STRETCHES, N // 5))])
+            stretches = np.array([piece.mean() for piece in np.array_split(values, min(STRETCHES, N // 5))])
             apart = mean / max(float(stretches.std(ddof=1)) / np.sqrt(len(stretches)), 1e-300)
             below = max(0.0, 1 - _own_share(readings, i) ** 0.5 / abs(mean))  # what of it is beyond a large one
             p, p_large = (
@@ -201,8 +201,8 @@ def diverged(case: Case) -> Iterator[Finding]:
 
 
 def _blocks(readings: Readings) -> tuple[int, int]:
-    """Length and number of blocks: 24 of them, of at least five readings."""
-    block = max(5, len(readings) // 24)
+    """Length and number of blocks: one of each stretch, of at least five readings."""
+    block = max(5, len(readings) // STRETCHES)
     return block, len(readings) // block
 
 

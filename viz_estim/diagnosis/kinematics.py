@@ -12,7 +12,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3
 from viz_estim.diagnosis.axes import explains, finding_of, maps, units
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, Finding, judge, level
+from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, SOLVABLE, Finding, judge, level
 from viz_estim.diagnosis.fits import STRETCHES
 from viz_estim.diagnosis.naming import likeliest, of_motion
 from viz_estim.diagnosis.sensors import Imu, imu
@@ -99,7 +99,7 @@ def scale(case: Case) -> Iterator[Finding]:
 def _slopes(X: Array, change: Array) -> list[tuple[float, float]]:
     """The coefficients of change (W, 3) on X (W, 3, k), and the p of each if it is 5 % off 1 at most."""
     A = np.einsum("wki,wkj->ij", X, X)
-    if not np.isfinite(A).all() or np.linalg.cond(A) > 1e6:
+    if not np.isfinite(A).all() or np.linalg.cond(A) > SOLVABLE:
         return []
     inverse = np.linalg.inv(A)
     s = inverse @ np.einsum("wki,wk->i", X, change)
