@@ -10,7 +10,7 @@ from test_thresholds import case_of, severities
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean, Product
-from viz_estim.diagnosis import clocks, confidence, errors, evidence, sensors, truth, weighing
+from viz_estim.diagnosis import clocks, confidence, errors, evidence, kinematics, sensors, truth, weighing
 from viz_estim.diagnosis.finding import _FAMILIES, GROSS, times
 from viz_estim.diagnosis.fits import Against
 from viz_estim.diagnosis.outlying import outlying
@@ -150,6 +150,13 @@ def test_a_smooth_signal_or_noise_in_counts_is_not_saturated(kind: str) -> None:
         of = case_of(np.zeros((10, 1))).run
         of = replace(of, inputs={"z.range": count * np.round(z / count)[:, None]}, step=np.arange(3000), time=t)
         assert not list(sensors.saturated(of))
+
+
+@pytest.mark.parametrize("shared", [1, 4, 10])
+def test_the_windows_that_share_a_push_are_counted(shared: int) -> None:
+    rng = np.random.default_rng(20)
+    pushes = [np.repeat(np.square(rng.standard_normal((40, 3))).sum(1), shared) for _ in range(50)]
+    assert np.median([kinematics._dependent(left) for left in pushes]) == pytest.approx(shared, rel=0.3)
 
 
 def test_a_factor_near_one_keeps_three_digits() -> None:
