@@ -339,3 +339,11 @@ def test_a_quaternion_off_the_sphere_is_seen_whatever_its_size() -> None:
     step = int(recorded.stages["predict"].step[50])
     assert told.steps == (step, step)
     assert np.allclose(quaternions.length(recorded.mean[:, :4]), 1)
+    q = quaternions.exp(np.linspace(0.0, 9.0, len(recorded.step))[:, None] * [0.6, 0.5, 0.4])
+    kinds = []
+    for sign in (np.where(q[:, :1] < 0, -1, 1), (-1) ** (np.arange(len(q))[:, None] // 40)):  # one half; at will
+        moved = replace(recorded, stages={}, ends=recorded.ends | {"mean": np.hstack([sign * q, recorded.mean[:, 4:]])})
+        kinds.append(
+            [f.evidence["kind"] for f in geometry.quaternion_norms(evidence.Case(moved, {}, evidence.Sequence(moved)))]
+        )
+    assert kinds == [[], ["sign"]]
