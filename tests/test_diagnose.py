@@ -22,13 +22,13 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Scenario, Tick, run
 from viz_estim.core.unscented import AugmentedFilter
 from viz_estim.diagnose import CODES, diagnose
-from viz_estim.diagnosis import evidence, geometry, signatures
+from viz_estim.diagnosis import evidence, geometry, signatures, tuning
 from viz_estim.diagnosis.axes import maps
 from viz_estim.diagnosis.finding import Finding, judge, level
 from viz_estim.recording.memory import collect
 from viz_estim.recording.reader import Run
 from viz_estim.running import plan
-from viz_estim.scenarios import diffdrive, imu, landmarks, plaza, quadrotor
+from viz_estim.scenarios import diffdrive, flawed_data, imu, landmarks, plaza, quadrotor
 
 SEEDS = 20
 
@@ -229,6 +229,23 @@ def test_a_tuned_noise_is_the_one_that_the_data_have() -> None:
     assert "set range_noise to about 0." in remedy.remedy
 
 
+def test_noises_are_tuned_where_a_gate_refuses_one_reading_of_two() -> None:
+    recorded = healthy("imu-ukf")[3]
+    name, table = next((n, t) for n, t in recorded.stages.items() if "innovation.used" in t.values)
+    used = table.values["innovation.used"].copy()
+    used[::9, 0] = 0
+    gated = replace(table, values=table.values | {"innovation.used": used})
+    tuned = tuning.factors(evidence.case(replace(recorded, stages=recorded.stages | {name: gated})))
+    assert all(0.5 < tuned[kind].factor < 2 for kind in ("accel", "gyro")), tuned
+
+
+def test_glitches_are_no_matter_of_a_noise() -> None:
+    scenario = landmarks.landmarks_ekf(landmarks.landmarks(None, np.random.default_rng(2), duration=20.0))
+    scenario = flawed_data.with_glitches(scenario, 0.03, 4.0)
+    tuned = tuning.factors(evidence.case(collect(scenario, run(scenario))))
+    assert all(0.5 < one.factor < 2 and one.gain < 1 for one in tuned.values()), tuned
+
+
 @pytest.mark.parametrize("delay", [0.03, 0.05, 0.1])
 def test_a_lag_is_measured(delay: float) -> None:
     data = imu.imu(None, np.random.default_rng(7), duration=6.0, still=0.6, freeze=0.0)
@@ -318,3 +335,11 @@ def test_a_quaternion_off_the_sphere_is_seen_whatever_its_size() -> None:
     step = int(recorded.stages["predict"].step[50])
     assert told.steps == (step, step)
     assert np.allclose(quaternions.length(recorded.mean[:, :4]), 1)
+    q = quaternions.exp(np.linspace(0.0, 9.0, len(recorded.step))[:, None] * [0.6, 0.5, 0.4])
+    kinds = []
+    for sign in (np.where(q[:, :1] < 0, -1, 1), (-1) ** (np.arange(len(q))[:, None] // 40)):  # one half; at will
+        moved = replace(recorded, stages={}, ends=recorded.ends | {"mean": np.hstack([sign * q, recorded.mean[:, 4:]])})
+        kinds.append(
+            [f.evidence["kind"] for f in geometry.quaternion_norms(evidence.Case(moved, {}, evidence.Sequence(moved)))]
+        )
+    assert kinds == [[], ["sign"]]

@@ -10,9 +10,10 @@ from test_thresholds import case_of, severities
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean, Product
-from viz_estim.diagnosis import clocks, confidence, errors, evidence, sensors, truth, weighing
+from viz_estim.diagnosis import clocks, confidence, errors, evidence, kinematics, sensors, truth, weighing
 from viz_estim.diagnosis.finding import _FAMILIES, GROSS, times
 from viz_estim.diagnosis.fits import Against
+from viz_estim.diagnosis.outlying import outlying
 from viz_estim.scenarios.imu_health import GRAVITY, frozen_gyro, still_prefix
 
 SHARE = 0.05 / _FAMILIES  # of a check: warnings a run
@@ -115,22 +116,47 @@ def test_errors_that_follow_one_another_keep_to_the_share(rho: float) -> None:
 @pytest.mark.parametrize("dof", [1, 3])
 def test_outliers_are_set_apart_without_more_alarms_of_size_and_a_large_noise_has_none(dof: int) -> None:
     rng, draws = np.random.default_rng(17), 600
-    found = sum(confidence.size(rng.chisquare(dof, 200), dof)[1] < SHARE for _ in range(draws))
+    found = sum(confidence.size(rng.chisquare(dof, 200), dof, 1)[1] < SHARE for _ in range(draws))
     assert found <= draws * SHARE + 3 * (draws * SHARE) ** 0.5
-    assert not any(confidence._far(3 * rng.chisquare(dof, 400), dof).any() for _ in range(100))
+    for factor in (1.0, 1.5, 3.0):  # also of a noise that is too small
+        alarms = sum(outlying(factor * rng.chisquare(dof, 400), dof, 1).far.any() for _ in range(draws))
+        assert alarms <= draws * SHARE + 3 * (draws * SHARE) ** 0.5
     glitches = np.append(rng.chisquare(dof, 400), [60.0] * 8)
-    assert confidence._far(glitches, dof)[-8:].all()
+    assert outlying(glitches, dof, 1).far[-8:].all()
 
 
-@pytest.mark.parametrize("lost", [0.0, 0.02, 0.1])
-def test_readings_lost_by_chance_are_no_silence(lost: float) -> None:
+@pytest.mark.parametrize(("lost", "longest"), [(0.0, 1), (0.02, 1), (0.3, 1), (0.02, 7)])
+def test_readings_lost_by_chance_are_no_silence(lost: float, longest: int) -> None:
+    """longest: of the sensor's own intervals, in steps; the shortest is half of it."""
     rng, draws, found = np.random.default_rng(18), 300, 0
     for _ in range(draws):
-        z = np.where((rng.random(600) < lost)[:, None], np.nan, rng.standard_normal((600, 1)))
+        at = np.cumsum(rng.integers(max(1, longest // 2), longest + 1, 600))
+        at = at[(at < 600) & (rng.random(600) >= lost)]
+        z = np.full((600, 1), np.nan)
+        z[at] = rng.standard_normal((len(at), 1))
         of = case_of(np.zeros((600, 1))).run
         of = replace(of, inputs={"z.range": z}, step=np.arange(600), time=0.1 * np.arange(600))
         found += bool(list(sensors.silent(of)))
     assert found <= draws * SHARE + 3 * (draws * SHARE) ** 0.5
+
+
+@pytest.mark.parametrize("kind", ["sine", "noise", "both"])
+def test_a_smooth_signal_or_noise_in_counts_is_not_saturated(kind: str) -> None:
+    rng, t = np.random.default_rng(19), 0.01 * np.arange(3000)
+    for _ in range(30):
+        smooth = 10 * np.sin(rng.uniform(0.1, 3.0) * t + rng.uniform(0, 6))
+        z = (kind != "noise") * smooth + (kind != "sine") * rng.standard_normal(3000)
+        count = rng.choice([0.02, 0.1, 0.3])
+        of = case_of(np.zeros((10, 1))).run
+        of = replace(of, inputs={"z.range": count * np.round(z / count)[:, None]}, step=np.arange(3000), time=t)
+        assert not list(sensors.saturated(of))
+
+
+@pytest.mark.parametrize("shared", [1, 4, 10])
+def test_the_windows_that_share_a_push_are_counted(shared: int) -> None:
+    rng = np.random.default_rng(20)
+    pushes = [np.repeat(np.square(rng.standard_normal((40, 3))).sum(1), shared) for _ in range(50)]
+    assert np.median([kinematics._dependent(left) for left in pushes]) == pytest.approx(shared, rel=0.3)
 
 
 def test_a_factor_near_one_keeps_three_digits() -> None:

@@ -13,7 +13,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.run import run
 from viz_estim.core.spaces import Euclidean
 from viz_estim.diagnose import diagnose
-from viz_estim.diagnosis import confidence, evidence, gates, innovations, models, motion, sensors
+from viz_estim.diagnosis import confidence, evidence, gates, innovations, models, motion, particles, sensors
 from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
 from viz_estim.recording.memory import collect
 from viz_estim.recording.reader import Run
@@ -226,3 +226,17 @@ def test_a_clipped_sensor_is_an_error_where_more_than_a_fiftieth_is_lost(share: 
         of = replace(walk(), inputs=given, step=np.arange(4000), time=0.1 * np.arange(4000))
         found += severities(sensors.saturated(of))
     assert {one for _, one in found} == severity
+
+
+@pytest.mark.parametrize(
+    ("left", "share", "severity"), [(20, 1.0, []), (16, 0.01, ["warning"]), (16, 1.0, ["error"]), (3, 0.3, ["error"])]
+)
+def test_few_particles_are_an_error_where_the_run_s_variance_is_too_small_too_often(
+    left: float, share: float, severity: list[str]
+) -> None:
+    table = next(t for t in walk().stages.values() if t.name.startswith("update"))
+    M = len(table.step)
+    values = {"ess": np.where(np.arange(M) < share * M, left, 400.0), "states": np.zeros((M, 800, 1))}
+    stages = {table.name: replace(table, values=values)}
+    of = evidence.Case(replace(walk(), stages=stages, step=table.step), {}, evidence.Sequence(walk()))
+    assert [finding.severity for finding in particles.collapsed(of)] == severity

@@ -14,6 +14,7 @@ from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, SO2, SO3, Product, Space
 from viz_estim.diagnosis.evidence import Case, jacobians, once, tells_gain, tells_reading
+from viz_estim.diagnosis.finding import HALF_THE_DIGITS
 from viz_estim.diagnosis.fits import Against
 from viz_estim.diagnosis.likelihoods import by_particles
 from viz_estim.diagnosis.recovered import recovered
@@ -112,7 +113,7 @@ def _along(
 ) -> tuple[Array, np.ndarray, Callable[[Array, np.ndarray], Array]]:
     """The errors (M, d) of the directions that readings see, where these are known, and what bounds J·e."""
     error = case.space.minus(truth, mean)
-    seen = (np.abs(np.nan_to_num(H)) > 1e-9 * np.nan_to_num(np.abs(H)).max()).any((0, 1))
+    seen = (np.abs(np.nan_to_num(H)) > HALF_THE_DIGITS * np.nan_to_num(np.abs(H)).max()).any((0, 1))
     error[:, ~seen] = 0.0  # what no reading sees need not be known
     return error, np.asarray(np.isfinite(error).all(1)), lambda J, rows: slip(J, error[rows], mean[rows], case.space)
 
@@ -128,8 +129,8 @@ def slip(J: Array, error: Array, mean: Array, space: Space) -> Array:
     Where it turns with an angle, an error of that angle (rad) changes it by as large a share; infinite beyond 0.1 rad.
     Else ½·L·|e|², with L from its changes between neighbouring rows, over the directions that it sees.
     """
-    seen = (np.abs(J).max((0, 1)) > 1e-9 * np.abs(J).max()) & (error**2).any(0)
-    bends = seen & (np.abs(J - J[:1]).max((0, 1)) > 1e-6 * np.abs(J).max())
+    seen = (np.abs(J).max((0, 1)) > HALF_THE_DIGITS * np.abs(J).max()) & (error**2).any(0)
+    bends = seen & (np.abs(J - J[:1]).max((0, 1)) > HALF_THE_DIGITS * np.abs(J).max())
     if not bends.any():
         return np.zeros(len(J))
     angles = np.array([unit == "rad" for unit in space.axis_units]) & seen

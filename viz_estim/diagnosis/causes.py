@@ -13,6 +13,7 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean
 from viz_estim.diagnosis.axes import explains, maps
+from viz_estim.diagnosis.finding import level
 from viz_estim.diagnosis.fits import Against, Fitted, fitted, white
 from viz_estim.diagnosis.naming import named, of_reading
 
@@ -71,7 +72,7 @@ def lever_arm(one: Against) -> Iterator[Cause]:
     size = np.abs(fit.coefficients) / _std(one)
     worst = int(np.argmax(size))
     words = [f"{abs(v):.2g} m {way[int(v < 0)]}" for v, way, p in zip(fit.coefficients, _WAYS, fit.p, strict=False)
-             if p < 0.01]  # fmt: skip
+             if p < level("warning", 1)]  # fmt: skip
     yield Cause(
         "biased_innovation", fit.gain, len(fit.coefficients), float(fit.p[worst]),
         fit.p_beyond(worst, float(np.sqrt(np.mean(one.foreseen)))), float(size[worst]), fit.explained,
@@ -97,8 +98,8 @@ def lag(one: Against, interval: float) -> Iterator[Cause]:
     m = rate.shape[1]
     design = np.concatenate([-rate[..., None], np.broadcast_to(np.eye(m), (len(rate), m, m))], axis=-1)
     both, alone = fitted(middle, design), fitted(middle, design[..., :1])
-    # A constant beside it costs power where the way is straight; it is fitted only where there is one.
-    fit = both if both.p[1:].min() < 0.05 else alone
+    # A constant beside it costs power where the way is straight; it is fitted only where there is one for sure.
+    fit = both if both.p[1:].min() < level("warning", m) else alone
     p, tau = float(fit.p[0]), float(fit.coefficients[0])
     shift = float(np.sqrt(np.mean(white(middle, tau * rate) ** 2)))
     if abs(tau) < 0.5 * interval or abs(tau) > 0.1 * (one.time[-1] - one.time[0]):

@@ -12,17 +12,17 @@ import numpy as np
 import scipy
 
 from viz_estim.core.consistency import squared_distance
-from viz_estim.core.distributions import binom, chi2, norm
+from viz_estim.core.distributions import chi2, norm
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis import tuning
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, Finding, judge, level, times
+from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, Finding, judge, times
+from viz_estim.diagnosis.outlying import outlying
 
 # A covariance too small by GROSS is an error, by less a warning; too large is never one: it costs, and misleads nobody.
 # S goes as the root of Q, as that of a random walk does in its steady state, P ≈ √(Q·R): Q may be wrong by its square.
 _GROSS_Q = GROSS**2
 _FEWEST = 10
-_TAIL = 1e-3
 
 
 def by_sensor(case: Case, *, tune: bool) -> Iterator[Finding]:
@@ -55,12 +55,12 @@ def _by_sensor(case: Case, tune: bool) -> Iterator[Finding]:
         N, dof = len(readings), readings.dof
         if N < _FEWEST:
             continue
-        ratio, p, p_gross = size(readings.nis, dof)
+        ratio, p, p_gross = size(readings.nis, dof, len(case.sensors))
         if judge(p, 2 * len(case.sensors), large=False) is None:
             continue
-        over = ratio > 1
+        over, far = ratio > 1, outlying(readings.nis, dof, len(case.sensors)).far
         tuned, rho = tuning.factors(case) if tune else {}, lag_one(readings.white)
-        factor = tuned[name].factor if name in tuned else factor_on_noise(readings.pick(~_far(readings.nis, dof)))
+        factor = tuned[name].factor if name in tuned else factor_on_noise(readings.pick(~far))
         if factor is not None and ((factor > 1) != over or not 1e-4 < factor < 1e4):
             factor = None
         evidence = {"mean_nis": float(readings.nis.mean()), "dof": dof, "readings": N, "p": p, "factor_on_R": factor}
@@ -89,7 +89,11 @@ def _by_process(case: Case) -> Iterator[Finding]:
     It tells a wrong Q from innovations whose size is right and whose order is not. Only looked at where innovations
     look odd at the level of 0.05, by their size or by Ljung and Box, which can but lower its false alarms.
     """
-    looks = [min(size(r.nis, r.dof)[1], ljung_box(r)) for r in case.sensors.values() if len(r) >= 2 * _FEWEST]
+    looks = [
+        min(size(r.nis, r.dof, len(case.sensors))[1], ljung_box(r))
+        for r in case.sensors.values()
+        if len(r) >= 2 * _FEWEST
+    ]
     if not looks or min(looks) > 0.05:
         return
     tuned = tuning.factors(case)
@@ -135,36 +139,26 @@ def ljung_box(readings: Readings, lags: int = 10) -> float:
     return float(chi2.sf(Q, rho.size))
 
 
-def size(nis: Array, dof: int) -> tuple[float, float, float]:
+def size(nis: Array, dof: int, sensors: int) -> tuple[float, float, float]:
     """How large NIS are, as a multiple of what they should be; the chance of that; and that of as much or more if S is
-    too small by GROSS.
-
-    Without those that are a matter of outliers (`_far`): the mean of χ²(dof) below c is dof·F(c; dof + 2)/F(c; dof),
-    its second moment dof·(dof + 2)·F(c; dof + 4)/F(c; dof).
-    """
-    c, far = chi2.isf(_TAIL, dof), _far(nis, dof)
+    too small by GROSS. Without outliers (`outlying`), of a run with so many sensors."""
+    far, bound, _ = outlying(nis, dof, sensors)
     if not far.any():
         total, n = float(nis.sum()), len(nis) * dof
         p = 2 * min(chi2.sf(total, n), chi2.cdf(total, n))
         return total / n, float(p), float(chi2.sf(total / GROSS, n))
-    held = chi2.cdf(c, dof)
-    mean = dof * chi2.cdf(c, dof + 2) / held
-    variance = dof * (dof + 2) * chi2.cdf(c, dof + 4) / held - mean**2
-    found, error = float(nis[~far].mean()), float(np.sqrt(variance / (~far).sum()))
-    p_gross = norm.sf((found / GROSS - mean) / error)
-    return found / mean, float(2 * norm.sf(abs(found - mean) / error)), float(p_gross)
+    mean, score = _below(nis[~far], dof, bound)
+    _, beyond = _below(nis[~far] / GROSS, dof, bound / GROSS)
+    return float(nis[~far].mean()) / mean, float(2 * norm.sf(abs(score))), float(norm.sf(beyond))
 
 
-def _far(nis: Array, dof: int) -> np.ndarray:
-    """Which NIS (M,) are a matter of outliers: those beyond χ²'s quantile of 1 − 10⁻³, where these are more than the
-    middle foretells by its size, or one is too far for it (at a warning's share, as in `innovations.outliers`); none
-    where the middle is too large by GROSS itself, for then it is the noise. The middle is an estimate, so that this
-    level is a few times its share; it sorts readings, and a finding's rate is that of `size`."""
-    far = nis > chi2.isf(_TAIL, dof)
-    middle = max(1.0, float(np.median(nis)) / chi2.median(dof))
-    share = chi2.sf(chi2.isf(_TAIL, dof) / middle, dof)
-    p = min(binom.sf(far.sum() - 1, len(nis), share), len(nis) * chi2.sf(nis.max(initial=0.0) / middle, dof))
-    return far if middle < GROSS and p < level("warning", 1) else np.zeros(len(nis), bool)
+def _below(nis: Array, dof: int, bound: float) -> tuple[float, float]:
+    """The mean of χ²(dof) below a bound c, and by how many standard errors that of NIS which are below it is larger:
+    dof·F(c; dof + 2)/F(c; dof), with the second moment dof·(dof + 2)·F(c; dof + 4)/F(c; dof)."""
+    held = chi2.cdf(bound, dof)
+    mean = float(dof * chi2.cdf(bound, dof + 2) / held)
+    variance = dof * (dof + 2) * chi2.cdf(bound, dof + 4) / held - mean**2
+    return mean, float((nis.mean() - mean) / np.sqrt(variance / len(nis)))
 
 
 def factor_on_noise(readings: Readings) -> float | None:

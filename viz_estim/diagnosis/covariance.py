@@ -9,9 +9,7 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.evidence import Case, tells_gain
-from viz_estim.diagnosis.finding import GROSS, Finding
-
-_HALF = float(np.sqrt(np.finfo(float).eps))  # half of the digits: what is beyond is no rounding that piled up
+from viz_estim.diagnosis.finding import GROSS, HALF_THE_DIGITS, SOLVABLE, Finding
 
 
 def broken(case: Case) -> Iterator[Finding]:
@@ -47,8 +45,8 @@ def broken(case: Case) -> Iterator[Finding]:
         # A variance of zero is a state that is given; it tells of no combination that is.
         singular = d * np.finfo(float).eps * condition > np.sqrt(2 / T)
         for kind, figure, bad in (
-            ("asymmetric", skew, skew > np.maximum(rounding, _HALF)),
-            ("rounding", skew, (skew > rounding) & (skew <= _HALF)),
+            ("asymmetric", skew, skew > np.maximum(rounding, HALF_THE_DIGITS)),
+            ("rounding", skew, (skew > rounding) & (skew <= HALF_THE_DIGITS)),
             ("negative", -negative, negative < -np.minimum(rounding, 0.5)),
             ("ill-conditioned", condition, singular & (negative >= -np.minimum(rounding, 0.5))),
         ):
@@ -102,13 +100,13 @@ def claims(case: Case) -> Iterator[Finding]:
         inside = np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, table.cov[rows][fine]), 1, 2))
         ratio = np.linalg.eigvalsh(0.5 * (inside + np.swapaxes(inside, 1, 2)))[:, 0]
         shrunk = np.diagonal(before[rows][fine], axis1=1, axis2=2) / np.diagonal(least[fine], axis1=1, axis2=2)
-        bad = ratio < 1 - np.minimum(_HALF * shrunk.max(1), 1 - 1 / GROSS)
+        bad = ratio < 1 - np.minimum(HALF_THE_DIGITS * shrunk.max(1), 1 - 1 / GROSS)
         claimed = -np.log(np.maximum(ratio[bad], 1e-300)).sum()
         if bad.sum() > 1 and claimed > np.log1p(np.sqrt(2 / (len(ratio) * S.shape[-1]))):
             of = table.step[rows][fine][bad]
             worst = float(ratio[bad].min())
             yield Finding(
-                "covariance", "error" if GROSS * np.median(ratio[bad]) < 1 + _HALF else "warning", None,
+                "covariance", "error" if GROSS * np.median(ratio[bad]) < 1 + HALF_THE_DIGITS else "warning", None,
                 (int(of[0]), int(of[-1])),
                 {"kind": "claims", "least_ratio": worst, "stage": table.name, "count": int(bad.sum())},
                 f"at {int(bad.sum())} updates the covariance shrinks by more than the reading can tell (down to "
@@ -161,7 +159,7 @@ def bounds(case: Case) -> Iterator[Finding]:
         sigma = np.sqrt(np.maximum(np.diagonal(run.cov, axis1=1, axis2=2)[:, axes], 0)).max(1)
         falls = sigma[ends[1:]] / np.maximum(sigma[ends[:-1]], 1e-300)
         deaf = sigma[rows] < np.finfo(float).eps * np.abs(run.mean[rows][:, at]).max()
-        if sigma[rows[0]] > 0 and ((falls < (1 - _HALF) * fastest).all() or (deaf[-1] and not deaf[0])):
+        if sigma[rows[0]] > 0 and ((falls < (1 - HALF_THE_DIGITS) * fastest).all() or (deaf[-1] and not deaf[0])):
             step = int(run.step[rows[int(np.argmax(deaf))]] if deaf.any() else run.step[ends[0]])
             yield Finding(
                 "covariance", "error", None, (step, int(run.step[rows[-1]])), {"kind": "collapsed", "part": name},
@@ -170,7 +168,7 @@ def bounds(case: Case) -> Iterator[Finding]:
             )  # fmt: skip
         gains = np.diff(sigma[ends] ** 2) / np.maximum(np.diff(elapsed), 1e-12)
         if (
-            (gains[1:] > (1 - _HALF) * gains[:-1]).all()
+            (gains[1:] > (1 - HALF_THE_DIGITS) * gains[:-1]).all()
             and gains[0] > 0
             and sigma[rows[-1]] ** 2 > GROSS * sigma[rows[0]] ** 2
         ):
@@ -228,7 +226,7 @@ def unobservable(case: Case) -> Iterator[Finding]:
 def sound(P: Array) -> np.ndarray:
     """Which of covariances (M, d, d) are positive definite, and well enough conditioned to be solved with."""
     values = np.linalg.eigvalsh(P)
-    return (values[:, 0] > 0) & (values[:, -1] < 1e14 * np.maximum(values[:, 0], 1e-300))
+    return (values[:, 0] > 0) & (values[:, -1] < SOLVABLE * np.maximum(values[:, 0], 1e-300))
 
 
 def _information(P: Array, b: Array) -> Array:

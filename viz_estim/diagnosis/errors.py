@@ -13,7 +13,7 @@ from viz_estim.core.distributions import chi2, norm
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis import clouds, motion
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, Finding, judge, level, times
+from viz_estim.diagnosis.finding import GROSS, SOLVABLE, Finding, judge, level, times
 from viz_estim.diagnosis.icp import is_registration
 
 _FEWEST = 10
@@ -40,7 +40,7 @@ def start(case: Case) -> Iterator[Finding]:
         mean, P = table.mean[-1], table.cov[-1]
     error = case.space.minus(run.truth[k], mean)
     known = np.isfinite(error) & (np.diag(P) > 0)
-    if not known.any() or np.linalg.cond(P[known][:, known]) > 1e13:
+    if not known.any() or np.linalg.cond(P[known][:, known]) > SOLVABLE:
         return
     value, dof = float(error[known] @ np.linalg.solve(P[known][:, known], error[known])), int(known.sum())
     severity = judge(float(chi2.sf(value, dof)), 1, large=bool(value > GROSS * dof))

@@ -12,6 +12,7 @@ import numpy as np
 from viz_estim.core.consistency import squared_distance
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
+from viz_estim.diagnosis.finding import SOLVABLE
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.reader import Run
 from viz_estim.recording.tables import StageTable
@@ -204,10 +205,10 @@ def jacobians(P: Array, C: Array) -> Array:
     one is singular."""
     H = np.full((*C.shape[:1], C.shape[2], C.shape[1]), np.nan)
     ok = np.isfinite(P).all((1, 2)) & np.isfinite(C).all((1, 2))
-    if (np.linalg.cond(P[ok]) < 1e13).all():
+    if (np.linalg.cond(P[ok]) < SOLVABLE).all():
         solved = np.linalg.solve(P[ok], C[ok])
     else:
-        solved = np.linalg.pinv(P[ok], rcond=1e-12, hermitian=True) @ C[ok]
+        solved = np.linalg.pinv(P[ok], rcond=1 / SOLVABLE, hermitian=True) @ C[ok]
     H[ok] = np.swapaxes(solved, 1, 2)
     return H
 

@@ -71,6 +71,8 @@ _BUDGET: dict[Severity, float] = {"error": 1e-4, "warning": 0.05}  # false alarm
 GROSS = 2.0  # the factor on a variance from which on it is an error
 EXPLAINED = 1 - 1 / GROSS  # of a misfit, by its cause: without that the squares are wrong by less than GROSS
 SHEET = 0.05  # of a factor: what a gyro's or a wheel's data sheet leaves to a calibration
+HALF_THE_DIGITS = float(np.sqrt(np.finfo(float).eps))  # what is beyond is no rounding that piled up
+SOLVABLE = SHEET / (8 * float(np.finfo(float).eps))  # the condition κ by which a solve loses 8·ε·κ (Higham 2002, 7.2)
 ODDS = 20.0  # by which one cause must be likelier than another to be named alone: strong (Kass and Raftery 1995)
 _FAMILIES = 36  # statistical checks: each has an equal share, and shares it out among what it tests
 

@@ -12,29 +12,25 @@ import numpy as np
 
 from viz_estim.core.distributions import binom, chi2
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
+from viz_estim.diagnosis.finding import GROSS, HALF_THE_DIGITS, SHEET, Finding, judge, level
 from viz_estim.diagnosis.innovations import gate_name
-
-# What a gate may refuse whatever it is set to: 0.95 is the narrowest in use, and to throw away one good reading of
-# twenty makes a variance larger by as much.
-_REFUSED = 0.05
-_TAIL = 1e-3
+from viz_estim.diagnosis.outlying import outlying
 
 
 def gates(case: Case) -> Iterator[Finding]:
     """A gate that refuses too many, is locked out, refuses fewer than it says, or none where there are outliers.
 
-    Too many: more than Binomial(N, 0.05) lets it. An error where half of the readings are lost for sure, for then the
-    variance that they leave is larger by GROSS. Locked out: so long a row of refusals, to the end, as comes by chance
-    with N·qⁿ, q = 1 − g where that is known, and at least 0.05.
+    Too many: surely more than the share SHEET, for to throw away so many makes a variance larger by it. An error where
+    half of the readings are lost for sure, for then the variance that they leave is larger by GROSS. Locked out: so
+    long a row of refusals, to the end, as comes by chance with N·qⁿ, q = 1 − g where that is known, and at least SHEET.
     """
     for name, readings in case.sensors.items():
         refused = ~readings.used
         N, count, stated = len(readings), int(refused.sum()), _stated(case, readings)
         if count:
             first, length = _longest(refused)
-            q = max(1 - stated if stated else 0.0, _REFUSED)
-            p = float(binom.sf(count - 1, N, _REFUSED))
+            q = max(1 - stated if stated else 0.0, SHEET)
+            p = float(binom.sf(count - 1, N, SHEET))
             p_row = min(1.0, N * q**length) if first + length == N else 1.0
             locked = p_row < level("error", 4 * len(case.sensors))
             p_half = float(binom.sf(count - 1, N, 1 - 1 / GROSS))
@@ -64,7 +60,7 @@ def _narrow(case: Case, name: str, how: str, step: int, locked: bool, q: float) 
             f"{how}, and from step {step} on all of them: the estimate has left, and can't come back",
             f"set {gate}=none to see what is refused; raise the noises that are too small, then gate again",
         )
-    if q > _REFUSED:
+    if q > SHEET:
         return (
             f"{how}: it is set to pass no more than {1 - q:.2g} of the good ones",
             f"set {gate}=0.999: a gate is there for readings that the noise can't explain",
@@ -81,7 +77,7 @@ def _wide(case: Case, readings: Readings, g: float) -> Iterator[Finding]:
     name, dof, N = readings.name, readings.dof, len(readings)
     refused, gate = int((~readings.used).sum()), gate_name(case, readings.name)
     # Of the same numbers, of which a solve may lose half of the digits, and no more.
-    passed = readings.used & (readings.nis > chi2.ppf(g, dof) * (1 + np.sqrt(np.finfo(float).eps)))
+    passed = readings.used & (readings.nis > chi2.ppf(g, dof) * (1 + HALF_THE_DIGITS))
     if passed.any():
         rows = np.flatnonzero(passed)
         yield Finding(
@@ -92,11 +88,10 @@ def _wide(case: Case, readings: Readings, g: float) -> Iterator[Finding]:
             f"refuse where νᵀS⁻¹ν > χ².ppf({g:g}, {dof}): the square, with {name}'s own S and number of components",
         )  # fmt: skip
         return
-    scale = max(1.0, float(np.median(readings.nis)) / chi2.median(dof))
-    far = readings.used & (readings.nis / scale > chi2.isf(_TAIL, dof))
-    p_far, p_few = float(binom.sf(far.sum() - 1, N, _TAIL)), float(binom.cdf(refused, N, 1 - g))
+    far, _, p_far = outlying(readings.nis[readings.used], dof, 2 * len(case.sensors))
+    p_few = float(binom.cdf(refused, N, 1 - g))
     if severity := judge(p_far, 4 * len(case.sensors), large=False):
-        rows = np.flatnonzero(far)
+        rows = np.flatnonzero(readings.used)[far]
         steps = int(readings.step[rows[0]]), int(readings.step[rows[-1]])
         evidence = {"passed": len(rows), "refused": refused, "readings": N, "p": p_far}
         yield Finding(

@@ -11,7 +11,7 @@ from viz_estim.core.spaces import SO2, SO3, Euclidean, Product, Space, wrap
 from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.covariance import epsilon
 from viz_estim.diagnosis.evidence import Case, tells_reading
-from viz_estim.diagnosis.finding import Finding, level
+from viz_estim.diagnosis.finding import HALF_THE_DIGITS, Finding, level
 from viz_estim.diagnosis.kinematics import imu_axes, scale
 from viz_estim.recording.layout import leaves
 
@@ -104,7 +104,7 @@ def quaternion_norms(case: Case) -> Iterator[Finding]:
         flips = np.flatnonzero(((q[1:] * q[:-1]).sum(1) < 0) & (run.step[1:] > case.first)) + 1
         turned = np.linalg.norm(SO3().minus(q[1:], q[:-1]), axis=1)
         flips = flips[turned[flips - 1] < np.pi / 2]  # by a half turn either sign is as near
-        if len(flips) > 1 and len(flips) > len(q) / 200:
+        if len(flips) and (np.nanmin(q, 0) < -HALF_THE_DIGITS).all():  # else kept in a half of the sphere, as by q₀ ≥ 0
             yield Finding(
                 "angle_wrap", "warning", None, (int(run.step[flips[0]]), int(run.step[flips[-1]])),
                 {"kind": "sign", "part": name, "count": len(flips)},

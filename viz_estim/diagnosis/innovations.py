@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 from viz_estim.core.consistency import nees
-from viz_estim.core.distributions import binom, chi2, f, norm, t
+from viz_estim.core.distributions import chi2, f, norm, t
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
 from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
+from viz_estim.diagnosis.fits import STRETCHES
 from viz_estim.diagnosis.icp import is_registration
+from viz_estim.diagnosis.outlying import TAIL, outlying
 
 _FEWEST = 20
 _LAGS = 10
-_STRETCHES = 20
 # The correlation ρ of neighbours in a first-order process whose mean has a variance larger by GROSS, (1 + ρ)/(1 − ρ).
 _CORRELATED = (GROSS - 1) / (GROSS + 1)
-_TAIL = 1e-3  # the share of readings beyond the χ² quantile by which outliers are counted
 
 
 def biased(case: Case) -> Iterator[Finding]:
@@ -43,7 +43,7 @@ def biased(case: Case) -> Iterator[Finding]:
             if error <= 0:
                 continue
             score = mean / error
-            stretches = np.array([piece.mean() for piece in np.array_split(values, min(_STRETCHES, N // 5))])
+            stretches = np.array([piece.mean() for piece in np.array_split(values, min(STRETCHES, N // 5))])
             apart = mean / max(float(stretches.std(ddof=1)) / np.sqrt(len(stretches)), 1e-300)
             below = max(0.0, 1 - _own_share(readings, i) ** 0.5 / abs(mean))  # what of it is beyond a large one
             p, p_large = (
@@ -130,25 +130,20 @@ def _autocorrelations(values: Array, lags: int = _LAGS) -> Array:
 
 
 def outliers(case: Case) -> Iterator[Finding]:
-    """How many NIS lie beyond the χ² quantile of 1 − 10⁻³: binomial, if the tails are normal; and how far the largest.
-
-    NIS are first brought to their median, where that is above χ²'s: a noise that is too small is no outlier. Large are
-    those that no gate refuses and that alone double the mean of all.
-    """
+    """Readings that are outliers by `outlying`. Large are those that no gate refuses and that alone double the mean of
+    all, once these are brought to their median."""
     for name, readings in case.sensors.items():
         N, dof = len(readings), readings.dof
         if N < _FEWEST:
             continue
-        scale = max(1.0, float(np.median(readings.nis)) / chi2.median(dof))
-        far = readings.nis / scale > chi2.isf(_TAIL, dof)
-        count = int(far.sum())
-        p = float(min(binom.sf(count - 1, N, _TAIL), N * chi2.sf(readings.nis.max() / scale, dof)))
+        far, bound, p = outlying(readings.nis, dof, len(case.sensors))
+        count, scale = int(far.sum()), bound / chi2.isf(TAIL, dof)
         moving = (readings.nis[far & readings.used] / scale - dof).sum()
         severity = judge(p, 2 * len(case.sensors), large=bool(moving > (GROSS - 1) * dof * N))
         if severity:
             rows = np.flatnonzero(far)
             gated = int((~readings.used[far]).sum())
-            evidence: dict[str, Any] = {"outliers": count, "readings": N, "expected": N * _TAIL, "p": p}
+            evidence: dict[str, Any] = {"outliers": count, "readings": N, "expected": N * TAIL, "p": p}
             evidence |= {"refused_by_gate": gated, "largest_nis": float(readings.nis.max())}
             remedy = (
                 f"the gate refuses {gated} of them; look at the others by hand"
@@ -158,7 +153,7 @@ def outliers(case: Case) -> Iterator[Finding]:
             yield Finding(
                 "outliers", severity if gated < count else "note", name,
                 (int(readings.step[rows[0]]), int(readings.step[rows[-1]])), evidence,
-                f"{count} of {N} readings of {name} lie further off than one in a thousand should ({N * _TAIL:.2g} "
+                f"{count} of {N} readings of {name} lie further off than one in a thousand should ({N * TAIL:.2g} "
                 "expected): detours, glitches or wrong associations, which a normal noise does not have",
                 remedy,
             )  # fmt: skip
@@ -206,8 +201,8 @@ def diverged(case: Case) -> Iterator[Finding]:
 
 
 def _blocks(readings: Readings) -> tuple[int, int]:
-    """Length and number of blocks: 24 of them, of at least five readings."""
-    block = max(5, len(readings) // 24)
+    """Length and number of blocks: one of each stretch, of at least five readings."""
+    block = max(5, len(readings) // STRETCHES)
     return block, len(readings) // block
 
 

@@ -12,14 +12,13 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3
 from viz_estim.diagnosis.axes import explains, finding_of, maps, units
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, Finding, judge, level
+from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, SOLVABLE, Finding, judge, level
 from viz_estim.diagnosis.fits import STRETCHES
 from viz_estim.diagnosis.naming import likeliest, of_motion
 from viz_estim.diagnosis.sensors import Imu, imu
 from viz_estim.scenarios.imu_health import GRAVITY
 
 _WINDOW = 0.1  # s over which gravity's turn is compared with the gyro's
-_DEPENDENT = 4  # windows that share one push of the hand
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -39,26 +38,29 @@ def imu_axes(case: Case) -> Iterator[Finding]:
     if pieces is None:
         return
     turn, middle, change, steps = pieces
-    own = _left(turn, middle, change)
+    own = float(_left(turn, middle, change).sum())
     candidates = maps(3, "rad/s")
-    of_rate = [_left(turn @ M.T, middle, change) for _, M in candidates]
-    of_force = [
-        _left(turn, middle @ M.T, change @ M.T) if abs(np.linalg.det(M)) == 1 else np.inf for _, M in candidates
+    left_by_rate = [_left(turn @ M.T, middle, change) for _, M in candidates]
+    left_by_force = [
+        _left(turn, middle @ M.T, change @ M.T) if abs(np.linalg.det(M)) == 1 else np.full(len(turn), np.inf)
+        for _, M in candidates
     ]
+    of_rate, of_force = ([float(left.sum()) for left in those] for those in (left_by_rate, left_by_force))
     length = float(np.median(np.linalg.norm(both.force, axis=1)))
     least = min(*of_rate, *of_force)
     variance = max(least, 1e-12) / change.size
-    gain, explained = 0.5 * (own - least) / variance / _DEPENDENT, 1 - least / max(own, 1e-300)
+    pushes = _dependent(min((*left_by_rate, *left_by_force), key=lambda left: float(left.sum())))
+    gain, explained = 0.5 * (own - least) / variance / pushes, 1 - least / max(own, 1e-300)
     nothing = float(np.square(change).sum())  # what no turn at all would leave: a map that is no better is none
     if gain > -np.log(level("error", 2 * len(candidates))):
         blamed = _blamed(case, both)
         # Another map of the other sensor, where that is as likely: their windows share pushes of the hand.
-        alike = 0.5 * change.size / _DEPENDENT * np.log(min(of_force) / max(least, 1e-300)) < np.log(ODDS)
+        alike = 0.5 * change.size / pushes * np.log(min(of_force) / max(least, 1e-300)) < np.log(ODDS)
         if blamed == "accel" and alike:
             name, what = "accel", candidates[int(np.argmin(of_force))][0]
         else:
             name, what = "gyro", candidates[int(np.argmin(of_rate))][0]
-        if explains(what, own, least, nothing, change.size // _DEPENDENT) and nothing > GROSS * least:
+        if explains(what, own, least, nothing, int(change.size / pushes)) and nothing > GROSS * least:
             yield finding_of(name, steps, what, explained, gain)
     if not 1 / GROSS < length / GRAVITY < GROSS:  # a hand pulls by less than gravity, in the middle over a run
         for what in likeliest(length / GRAVITY, {name: 1 / value for name, value in units("m/s²").items()})[:1]:
@@ -99,7 +101,7 @@ def scale(case: Case) -> Iterator[Finding]:
 def _slopes(X: Array, change: Array) -> list[tuple[float, float]]:
     """The coefficients of change (W, 3) on X (W, 3, k), and the p of each if it is 5 % off 1 at most."""
     A = np.einsum("wki,wkj->ij", X, X)
-    if not np.isfinite(A).all() or np.linalg.cond(A) > 1e6:
+    if not np.isfinite(A).all() or np.linalg.cond(A) > SOLVABLE:
         return []
     inverse = np.linalg.inv(A)
     s = inverse @ np.einsum("wki,wk->i", X, change)
@@ -134,9 +136,17 @@ def _windows(case: Case, both: Imu) -> tuple[Array, Array, Array, tuple[int, int
     return turn[fine], middle[fine], change[fine], (int(at[0]), int(at[-1]))
 
 
-def _left(turn: Array, middle: Array, change: Array) -> float:
-    """Σ|Δg + θ × g|²."""
-    return float(np.square(change + quaternions.cross(turn, middle)).sum())
+def _left(turn: Array, middle: Array, change: Array) -> Array:
+    """|Δg + θ × g|² (W,)."""
+    return np.asarray(np.square(change + quaternions.cross(turn, middle)).sum(1))
+
+
+def _dependent(left: Array) -> float:
+    """How many windows share one push of the hand: 1 + 2·Σρₖ of the squares (W,) that are left, up to the first
+    ρₖ ≤ 0 (Geyer 1992)."""
+    about = left - left.mean()
+    rho = np.correlate(about, about, "full")[len(left) - 1 :] / max(float(about @ about), 1e-300)
+    return float(1 + 2 * rho[1 : int(np.argmax(rho <= 0))].sum()) if (rho <= 0).any() else float(len(left))
 
 
 def _blamed(case: Case, both: Imu) -> str:

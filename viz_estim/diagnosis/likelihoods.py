@@ -16,13 +16,13 @@ import scipy
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean, Space
+from viz_estim.diagnosis.covariance import epsilon
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.fits import Against
 from viz_estim.diagnosis.frames import place_of
 from viz_estim.recording.layout import leaves
 from viz_estim.recording.tables import StageTable
 
-_EXACT = 1e-4  # of the log-likelihoods' own standard deviation
 _STEPS, _PARTICLES = 12, 80  # that the model is fitted to
 _STARTS, _ROUNDS = 24, 60
 
@@ -92,8 +92,13 @@ def _of_positions(p: Array, logs: Array, z: Array) -> float | None:
     x = -0.5 * ((p - z[:, None, :]) ** 2).sum(-1)
     x, y = x - x.mean(1, keepdims=True), logs - logs.mean(1, keepdims=True)
     slope = float((x * y).sum() / max(float((x * x).sum()), 1e-300))
-    exact = np.sqrt(np.mean((y - slope * x) ** 2)) < _EXACT * y.std()
+    exact = np.sqrt(np.mean((y - slope * x) ** 2)) < _rounding(logs) * y.std()
     return 1 / slope if exact and slope > 0 else None
+
+
+def _rounding(logs: Array) -> float:
+    """Half of the digits: by how much of their own standard deviation log-likelihoods of the model may be off."""
+    return float(np.sqrt(epsilon(logs.reshape(-1, 1))))
 
 
 def _of_distances(p: Array, logs: Array, z: Array, truth: Array) -> tuple[Array, Array] | None:
@@ -129,7 +134,7 @@ def _of_distances(p: Array, logs: Array, z: Array, truth: Array) -> tuple[Array,
     for places in islice(_starts(truth, z, steps), _STARTS):
         start = np.concatenate([places.ravel(), np.zeros(s)])
         fit = scipy.optimize.least_squares(missed, start, slopes, method="lm", max_nfev=_ROUNDS)
-        if np.sqrt(np.mean(fit.fun**2)) < _EXACT:
+        if np.sqrt(np.mean(fit.fun**2)) < _rounding(logs):
             return fit.x[: s * d].reshape(s, d), np.exp(-fit.x[s * d :])
     return None
 

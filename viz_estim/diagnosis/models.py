@@ -16,14 +16,13 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.evidence import Case, tells_gain
-from viz_estim.diagnosis.finding import GROSS, Finding, Severity
+from viz_estim.diagnosis.finding import GROSS, HALF_THE_DIGITS, SOLVABLE, Finding, Severity
 
 # The share of its model's change by which a Jacobian is wrong that makes H·P·Hᵀ wrong by GROSS: (1 + s)² = 2.
 _LARGE = GROSS**0.5 - 1
 # Of the squares of what a sampled prediction leaves, n' − n of two draws, the motion in between holds n and not n': it
 # explains at most a half, while it explains all that a wrong Jacobian leaves.
 _HALF = 0.5
-_DIGITS = float(np.sqrt(np.finfo(float).eps))  # of the numbers: a smaller difference of two has lost half of them
 _FEWEST = 10
 
 
@@ -36,7 +35,7 @@ def measured(case: Case) -> Iterator[Finding]:
         assert isinstance(space, Product)
         mean, cov = case.sequence.before(table)
         rows = np.flatnonzero(np.isfinite(cov).all((1, 2)) & (table.step >= case.first))
-        rows = rows[np.linalg.cond(cov[rows]) < 1e13]
+        rows = rows[np.linalg.cond(cov[rows]) < SOLVABLE]
         if len(rows) < _FEWEST:
             continue
         H = np.swapaxes(np.linalg.solve(cov[rows], table.values["innovation.cross_cov"][rows]), 1, 2)
@@ -70,7 +69,7 @@ def _left(change: Array, expected: Array, may: Array, largest: float) -> tuple[f
     """
     size = np.linalg.norm(change, axis=1)
     missed = np.linalg.norm(np.maximum(np.abs(change - expected) - may, 0.0), axis=1)
-    rows = (size > _DIGITS * max(largest, 1.0)) & (np.linalg.norm(may, axis=1) < _HALF * size)
+    rows = (size > HALF_THE_DIGITS * max(largest, 1.0)) & (np.linalg.norm(may, axis=1) < _HALF * size)
     if rows.sum() < _FEWEST:
         return 0.0, 0
     return float(np.median(missed[rows] / size[rows])), int(rows.sum())
@@ -116,7 +115,7 @@ def predicted(case: Case) -> Iterator[Finding]:
         largest = float(np.abs(table.mean).max())
         left, count = _left(change - moved, expected - moved, may, largest)
         size = np.median(np.linalg.norm(rest, axis=1))
-        if size > _DIGITS * max(largest, 1.0) and ratio > unfelt and drift < _HALF:
+        if size > HALF_THE_DIGITS * max(largest, 1.0) and ratio > unfelt and drift < _HALF:
             evidence = {"size_in_Q": ratio, "stage": table.name}
             yield Finding(
                 "noisy_prediction", "error", None, steps, evidence,

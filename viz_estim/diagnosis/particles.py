@@ -11,44 +11,38 @@ from viz_estim.core.modes import moments, several
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import Finding, at_steps, level
+from viz_estim.diagnosis.finding import GROSS, ODDS, Finding, at_steps, level
 from viz_estim.recording.tables import StageTable
 
 _LOOKED_AT = 100  # steps at most, at which modes are looked for
 
-# Fewer effective particles than this, and the cloud's variance is too small by more than a factor of 2 in more than one
-# of twenty cases: with n independent ones it is χ²(n − 1)/(n − 1) of the true one.
-_GROSS, _ONE_IN_TWENTY = 2.0, 0.05
-_FEW = next(n for n in range(2, 100) if chi2.cdf((n - 1) / _GROSS, n - 1) < _ONE_IN_TWENTY)
-_NEAR = 0.1  # the share of a normal cloud that lies about its mean, to be held against what does
+_NEAR = 0.1  # the share of a normal cloud that lies about its mean, to be held against what does: it decides no rate
 
 
 def collapsed(case: Case) -> Iterator[Finding]:
-    """Effective sample size 1/Σw² (Kong, Liu and Wong 1994) and distinct ancestors: fewer than 17.
+    """Effective sample size 1/Σw² (Kong, Liu and Wong 1994) and distinct ancestors.
 
-    A cloud is a sample: its variance is too small by more than a factor of 2 in one of twenty cases where it has 17
-    independent particles, and more often below (χ²). A single time at the start is a warning, for a first reading may
-    well be far narrower than all that was possible.
+    A cloud is a sample: with n independent particles its variance is χ²(n − 1)/(n − 1) of the true one, and too small
+    by GROSS with a chance πₙ. That is no odd case, one in ODDS, with fewer than 17. An error where it is none of the
+    run either: the mean of πₙ over all steps, so that a first reading, which may be far narrower than all that was
+    possible, is no error.
     """
-    run = case.run
-    low: list[int] = []
-    least, count = np.inf, 0
+    run, N = case.run, _count(case)
+    left = np.full(len(run.step), np.inf)
     for table in run.stages.values():
         for name in ("ess", "distinct"):
             if name in table.values and "states" in table.values and table.values[name].ndim == 1:
-                count = count if count else table.values["states"].shape[1]
-                rows = (table.values[name] < min(_FEW, 0.5 * _count(case))) & (table.step >= case.first)
-                low += table.step[rows].tolist()
-                if rows.any():
-                    least = min(least, float(table.values[name][rows].min()))
-    steps = sorted(set(low))
-    if not steps:
+                np.fmin.at(left, np.searchsorted(run.step, table.step), table.values[name])
+    step, left = run.step[run.step >= case.first], left[run.step >= case.first]
+    dof = np.clip(left - 1, 1e-12, 1e6)  # 0 of a single one, and endless where nothing is known
+    chance = chi2.cdf(dof / GROSS, dof)
+    few = (chance > 1 / ODDS) & (left < N / GROSS)
+    if not few.any():
         return
-    N = _count(case)
-    lasting = len(steps) > 0.1 * len(run.step) or min(steps) > case.first + 3
+    steps, least = step[few].tolist(), float(left[few].min())
     evidence = {"least": least, "particles": N, "steps": len(steps)}
     yield Finding(
-        "particles_collapsed", "error" if lasting and len(steps) > 2 else "warning", None, (steps[0], steps[-1]),
+        "particles_collapsed", "error" if chance.mean() > 1 / ODDS else "warning", None, (steps[0], steps[-1]),
         evidence,
         f"{at_steps(len(steps))} hardly any of the {N} particles are left (as few as {least:.0f}): the readings are "
         "far narrower than the cloud, or the cloud has no particle where they are",
@@ -168,6 +162,7 @@ def far(case: Case) -> Iterator[Finding]:
 
     With normal noise a likelihood is ℓ = ℓ₀ − ½·χ²(m) for the true state, m numbers read, and larger for the best
     particle of a cloud that is about it. ℓ₀ is the largest of the run: no less than the truth would be too strict.
+    Large are misfits that alone double the mean of all, as of `innovations.outliers`.
     """
     run = case.run
     inputs = [name for name in run.inputs if name.startswith("z.")]
@@ -181,12 +176,14 @@ def far(case: Case) -> Iterator[Finding]:
         if rows.sum() < 5:
             continue
         top = {count: float(best[rows & (m == count)].max()) for count in np.unique(m[rows])}
-        p = np.array([chi2.sf(2 * (top[k] - b), k) for k, b in zip(m[rows], best[rows], strict=True)])
+        missed = 2 * (np.array([top[count] for count in m[rows]]) - best[rows])
+        p = chi2.sf(missed, m[rows])
         bad = p < level("error", int(rows.sum()))
+        large = (missed - m[rows])[bad].sum() > (GROSS - 1) * m[rows].sum()
         if bad.any():
             of = table.step[rows][bad]
             yield Finding(
-                "particles_far", "error" if bad.mean() > 0.05 else "warning", None, (int(of[0]), int(of[-1])),
+                "particles_far", "error" if large else "warning", None, (int(of[0]), int(of[-1])),
                 {"steps": int(bad.sum()), "least_p": float(p.min())},
                 f"{at_steps(int(bad.sum()))} no particle is where the readings are: even the best one explains "
                 "them worse than their noise allows",

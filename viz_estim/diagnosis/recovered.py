@@ -17,10 +17,10 @@ import numpy as np
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import S2, SE2, SO2, SO3, Euclidean, Product, Space
+from viz_estim.diagnosis.finding import HALF_THE_DIGITS
 from viz_estim.recording.layout import leaves
 
 _ROWS = 3  # pairs for each number of a fit, at least
-_SEEN = 1e-9  # of the largest singular value: a direction in which the estimates never moved tells nothing
 
 
 class Recovered(NamedTuple):
@@ -172,12 +172,12 @@ def _line(x: Array, y: Array, at: Array) -> tuple[Array, Array, Array, Array] | 
         return None
     size = np.maximum(np.abs(x[rows]).max(0), 1e-300)
     U, s, Vt = np.linalg.svd(x[rows] / size, full_matrices=False)
-    told = s > _SEEN * s[0]
+    told = s > HALF_THE_DIGITS * s[0]  # in other directions the estimates never moved
     coefficients = (Vt[told].T / s[told]) @ (U[:, told].T @ y[rows])
     known = np.asarray(np.isfinite(at).all(1))
     a = np.where(known[:, None], at, 0.0) / size
     leverage = np.linalg.norm(a @ (Vt[told].T / s[told]), axis=1) * np.sqrt(rows.sum())
-    beside = np.linalg.norm(a @ Vt[~told].T, axis=1) > 1e-6 * np.linalg.norm(a, axis=1)
+    beside = np.linalg.norm(a @ Vt[~told].T, axis=1) > HALF_THE_DIGITS * np.linalg.norm(a, axis=1)
     own = np.where(rows[:, None], x, 0.0) / size @ coefficients
     far = np.where(known & ~beside, leverage, np.inf)
     scaled = coefficients / (size[:, None] if coefficients.ndim > 1 else size)

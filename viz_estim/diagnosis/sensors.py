@@ -13,8 +13,9 @@ from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, judge, level
 from viz_estim.recording.reader import Run
 from viz_estim.scenarios.imu_health import DRIFT, GRAVITY, frozen_accel, frozen_gyro, still_prefix
 
-_AT_THE_END = 0.75  # of a smooth signal's extreme and next value: an arc sine has 0.71 at its extreme
-_CLIPPED = 0.02  # of the readings: a normal signal that is clipped there loses as much of its variance in one tail
+# Of the time within two counts of an extreme that a smooth signal spends within one: its way there is a parabola's. The
+# same of a regular sensor's intervals beyond 1.5 medians, had it Poisson's: (1/2)^1.5.
+_AT_THE_END, _LATE = 0.5**0.5, 0.5**1.5
 
 
 class Given(NamedTuple):
@@ -93,7 +94,7 @@ def frozen(run: Run) -> Iterator[Finding]:
             n = last - first + 2
             elsewhere = max((same.sum() - (n - 1)) / len(same), 1 / len(same))
             p = len(same) * elsewhere ** (n - 1)
-            if n >= 5 and p < level("error", len(sensors)):
+            if p < level("error", len(sensors)):
                 yield _stuck(run, name, rows[first], rows[last + 1], {"level": values[first]})
 
 
@@ -127,9 +128,9 @@ def silent(run: Run) -> Iterator[Finding]:
     """A pause in a sensor's readings that is too long for chance. An error where it lasts to the end, and is too long
     even for arrivals that are as irregular as can be.
 
-    Of regular readings (nineteen of twenty intervals are at most 1.5 medians) each is lost with the share q that is
-    lost elsewhere, at least 1/N: k in a row with N·qᵏ at most. Else arrivals are taken as a Poisson process, whose
-    longest of N pauses of mean μ exceeds g with 1 − (1 − e^(−g/μ))ᴺ.
+    Of regular readings (fewer intervals beyond 1.5 medians than a Poisson process has, for sure) each is lost with the
+    share q that is lost elsewhere, at least 1/N: k in a row with N·qᵏ at most. Else arrivals are taken as a Poisson
+    process, whose longest of N pauses of mean μ exceeds g with 1 − (1 − e^(−g/μ))ᴺ.
     """
     sensors = given(run)
     for name, (rows, _) in sensors.items():
@@ -137,11 +138,11 @@ def silent(run: Run) -> Iterator[Finding]:
             continue
         gaps = np.diff(np.append(rows, len(run.step)))  # up to the run's end: there it is silent for good
         usual, N = float(np.median(gaps)), len(gaps)
-        regular = float(np.quantile(gaps, 0.95)) <= 1.5 * usual
+        regular = binom.cdf((gaps > 1.5 * usual).sum(), N, _LATE) < level("warning", len(sensors))
         longest = int(np.argmax(gaps))
         irregular = -np.expm1(N * np.log1p(-np.exp(-gaps / gaps.mean())))
         if regular:
-            lost = np.maximum(np.round(gaps / usual) - 1, 0)
+            lost = np.ceil(gaps / gaps[gaps <= 1.5 * usual].max()) - 1  # at least
             q = np.maximum(lost.sum() - lost, 1) / (N + lost.sum() - lost)
             p = np.where((lost > 0) & (gaps > usual + 2), np.minimum(N * q**lost, 1.0), 1.0)
             found = np.flatnonzero(p < level("warning", len(sensors)))
@@ -166,7 +167,7 @@ def saturated(run: Run, without: Sequence[tuple[int, int]] = ()) -> Iterator[Fin
     """Readings that pile up at a component's largest or smallest value: more of them than at the next value inside.
 
     without: intervals of steps (first, last) to leave out. Binomial: of the readings at the extreme and within one
-    quantum of it, a smooth signal has at most 3 of 4 there. Large is more than 2 % of all readings for sure, by a
+    quantum of it, a smooth signal has at most √½ there. Large is more than SHEET of all readings for sure, by a
     binomial test too.
     """
     sensors = {name: _left_of(run, one, without) for name, one in given(run).items()}
@@ -180,11 +181,11 @@ def saturated(run: Run, without: Sequence[tuple[int, int]] = ()) -> Iterator[Fin
                     continue
                 top = x == distinct[-1]
                 near = (x >= distinct[-1] - _quantum(distinct) * 1.5) | top
-                count, around = int(top.sum()), int(near.sum()) + 1
+                count, around = int(top.sum()), int(near.sum())
                 moving = (np.diff(x, prepend=np.nan) != 0) | (np.diff(x, append=np.nan) != 0)
                 p = float(binom.sf(count - 1, around, _AT_THE_END))
-                severity = judge(p, tests, large=float(binom.sf(count - 1, len(x), _CLIPPED)))
-                if severity and count >= 10 and moving[top].any():
+                severity = judge(p, tests, large=float(binom.sf(count - 1, len(x), SHEET)))
+                if severity and moving[top].any():
                     at = rows[np.flatnonzero(top)]
                     steps = int(run.step[at[0]]), int(run.step[at[-1]])
                     value = float(values[np.flatnonzero(top)[0], i])

@@ -20,11 +20,11 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
 from viz_estim.diagnosis import tuning
 from viz_estim.diagnosis.evidence import Case, jacobians, once, parameter, tells_gain, transitions
-from viz_estim.diagnosis.finding import EXPLAINED, Finding, judge, level
+from viz_estim.diagnosis.finding import EXPLAINED, SOLVABLE, Finding, judge, level
+from viz_estim.diagnosis.fits import STRETCHES
 from viz_estim.recording.tables import StageTable
 
 _BACK = 3  # readings over which a rate of change is taken: backwards, so that it is known before the innovation
-_STRETCHES = 20
 
 
 class Fault(NamedTuple):
@@ -169,11 +169,11 @@ def faults(case: Case) -> list[Fault]:
                 g = g + update.gain[row] @ s
         else:
             g = np.zeros((d, q))
-    A, b = np.zeros((_STRETCHES, q)), np.zeros((_STRETCHES, q))
+    A, b = np.zeros((STRETCHES, q)), np.zeros((STRETCHES, q))
     for update in updates.values():
         rows = update.sound & update.counts
         s, w = update.left[rows], update.inverse[rows] @ update.left[rows]
-        stretch = update.table.place[rows] * _STRETCHES // len(case.sequence.stage)
+        stretch = update.table.place[rows] * STRETCHES // len(case.sequence.stage)
         np.add.at(A, stretch, (s * w).sum(1))
         np.add.at(b, stretch, (update.residual[rows][:, None] @ w)[:, 0])
     if not np.isfinite(A).all():
@@ -217,7 +217,7 @@ class _Update:
         S = get["innovation.cov"]
         self.residual, self.gain = get["innovation.residual"], get["gain"]
         self.sound = np.asarray(np.isfinite(P).all((1, 2)) & np.isfinite(S).all((1, 2)))
-        self.sound[self.sound] &= np.linalg.cond(S[self.sound]) < 1e14
+        self.sound[self.sound] &= np.linalg.cond(S[self.sound]) < SOLVABLE
         d, m = get["innovation.cross_cov"].shape[1:]
         self.H, self.inverse = np.zeros((len(P), m, d)), np.zeros((len(P), m, m))
         ok = self.sound

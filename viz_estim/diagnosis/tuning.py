@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from viz_estim.core.consistency import squared_distance
 from viz_estim.core.distributions import chi2
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.evidence import Case, jacobians, once, tells_gain, transitions
+from viz_estim.diagnosis.outlying import outlying
 from viz_estim.recording.tables import StageTable
 
 _GRID = np.arange(-6.0, 6.5) * np.log(10) / 2  # log factors, 10⁻³ to 10³
@@ -178,7 +178,6 @@ def _scores(
     carried = {name: _carried(case, table) for name, table in updates.items()}
     d, score = len(space.axes), np.zeros(B)
     x, P = np.zeros((d, B)), None  # P (d, d, B)
-    skipped = _outlying(case, updates)
     for stage in case.sequence.stage[first : first + _PLACES]:
         if stage is None:
             continue
@@ -191,22 +190,19 @@ def _scores(
             nu, K = table.values["innovation.residual"][row], table.values["gain"][row]
             readings = turned[name]
             on = np.flatnonzero(readings.on[row])
-            if not len(on) or not np.isfinite(readings.H[row]).all() or not np.isfinite(nu).all():
-                x = x - (K @ np.nan_to_num(nu))[:, None] if np.isfinite(K).all() else x
-                continue
-            v, S = np.empty((2, len(on), B))
-            x, P = x.copy(), P.copy()
-            for k, i in enumerate(on):
-                h = readings.H[row, i]
-                C = (h @ P.reshape(d, d * B)).reshape(d, B)
-                S[k] = h @ C + noises[name][row, i]
-                v[k] = readings.residual[row, i] - h @ x
-                gain = C / S[k]
-                x += gain * v[k]
-                P -= gain[:, None] * C
-            if (name, row) not in skipped:
+            if len(on) and np.isfinite(readings.H[row]).all() and np.isfinite(nu).all():
+                v, S = np.empty((2, len(on), B))
+                x, P = x.copy(), P.copy()
+                for k, i in enumerate(on):
+                    h = readings.H[row, i]
+                    C = (h @ P.reshape(d, d * B)).reshape(d, B)
+                    S[k] = h @ C + noises[name][row, i]
+                    v[k] = readings.residual[row, i] - h @ x
+                    gain = C / S[k]
+                    x += gain * v[k]
+                    P -= gain[:, None] * C
                 score -= 0.5 * (v * v / S + np.log(S)).sum(0)
-            x -= (K @ nu)[:, None]
+            x = x - (np.nan_to_num(K) @ np.nan_to_num(nu))[:, None]
             if not space.flat:
                 T = carried[name][row]
                 x, P = T @ x, _mapped(P, T)
@@ -221,7 +217,7 @@ class _Turned(NamedTuple):
     H: Array  # (M, m, d)
     residual: Array  # (M, m)
     noise: Array  # (M, m), variances
-    on: np.ndarray  # (M, m), whether the reading was used
+    on: np.ndarray  # (M, m), whether the reading was used and is no outlier
     sensors: list[str]  # m
 
 
@@ -229,6 +225,7 @@ def _turned(case: Case, table: StageTable, before: Array) -> _Turned:
     get = table.values
     H, residual = jacobians(before, get["innovation.cross_cov"]).copy(), get["innovation.residual"].copy()
     noise, on, sensors = np.empty_like(residual), np.zeros(residual.shape, bool), []
+    steps = {name: r.step[~outlying(r.nis, r.dof, len(case.sensors)).far] for name, r in case.sensors.items()}
     for i, (part, axes) in enumerate(_parts(table).items()):
         sensor = part.partition("/")[0]
         sensors += [sensor] * (axes.stop - axes.start)
@@ -237,7 +234,8 @@ def _turned(case: Case, table: StageTable, before: Array) -> _Turned:
         noise[~np.isfinite(R).all((1, 2)), axes] = np.nan
         H[:, axes] = np.swapaxes(axis, 1, 2) @ H[:, axes]
         residual[:, axes] = (np.swapaxes(axis, 1, 2) @ residual[:, axes, None])[..., 0]
-        known = np.isin(table.step, case.sensors[sensor].step) if sensor in case.sensors else np.zeros(len(on), bool)
+        # As with a gate: an outlier that moved the estimate would make what comes after it a matter of Q.
+        known = np.isin(table.step, steps.get(sensor, ()))
         on[:, axes] = (get["innovation.offered"][:, i] * get["innovation.used"][:, i] * known > 0)[:, None]
     return _Turned(H, residual, noise, on, sensors)
 
@@ -262,17 +260,3 @@ def _noise(table: StageTable, F: Array, before: Array) -> Array:
     Q = np.nan_to_num(0.5 * (Q + np.swapaxes(Q, 1, 2)))
     values, vectors = np.linalg.eigh(Q)
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2))
-
-
-def _outlying(case: Case, updates: dict[str, StageTable]) -> set[tuple[str, int]]:
-    """The updates, by stage and row, with a reading beyond χ²'s quantile of 1 − 10⁻³, as long as these are few: a
-    matter of outliers, not of a noise."""
-    found: set[tuple[str, int]] = set()
-    for name, table in updates.items():
-        get = table.values
-        for axes in _parts(table).values():
-            nis = squared_distance(get["innovation.residual"][:, axes], get["innovation.cov"][:, axes, axes])
-            far = nis > chi2.isf(1e-3, axes.stop - axes.start)
-            if far.mean() <= 0.05:
-                found |= {(name, int(row)) for row in np.flatnonzero(far)}
-    return found

@@ -33,7 +33,7 @@ def noises(case: Case) -> Iterator[Finding]:
         variance.setdefault(name, []).append(float(np.trace(one.noise[0]) / len(one.noise[0])))
         steps[name], dof[name] = (int(one.step[0]), int(one.step[-1])), one.r.shape[1]
     for name, found in by_name.items():
-        factor, p, p_gross = size(np.concatenate(found), dof[name])
+        factor, p, p_gross = size(np.concatenate(found), dof[name], len(by_name))
         severity = judge(p, len(by_name), large=p_gross) if factor > 1 else None
         if severity:
             R, n = float(np.mean(variance[name])), sum(map(len, found)) * dof[name]
