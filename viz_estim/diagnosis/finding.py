@@ -43,6 +43,7 @@ CODES = {
     "units_or_axes": "swapped axes, a sign or another unit would explain the readings",
     "process_model": "the prediction does not move the state as the truth moves: a factor, a sign or a drift",
     "update": "an update does not do what its own numbers say: residual, S, gain, mean or covariance",
+    "prediction": "a prediction does not do what its own numbers say: its covariance is not F·P·Fᵀ + Q",
     "start": "the first belief is further from the truth than its covariance says",
     "jacobian": "a Jacobian is not the derivative of the model that it stands for",
     "noisy_prediction": "the prediction moves the mean at random: a sample of the noise was added to it",
