@@ -1,4 +1,4 @@
-"""Filters as their authors write and record them: a sound one is left alone, and nothing is claimed of what is not told."""
+"""Filters as their authors write and record them: sound ones are left alone, and what is not told is not judged."""
 
 from pathlib import Path
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import viz_estim
-from viz_estim.core.quaternions import Array
+from viz_estim.core import quaternions
+from viz_estim.core.spaces import SO3, Euclidean, Product
 from viz_estim.diagnose import diagnose
 from viz_estim.diagnosis.finding import Finding
 
@@ -43,3 +44,28 @@ def test_a_prediction_by_a_noisy_control_is_no_sample_of_q(control: bool, tmp_pa
     told = found(driven(tmp_path / "a.rrd", control=control))
     assert [(f.code, f.severity) for f in told] == ([] if control else [("noisy_prediction", "note")])
     assert control or "control" in told[0].remedy
+
+
+@pytest.mark.parametrize("carried", [0.0, 0.5, 1.0])
+def test_a_covariance_after_a_turn_may_stay_in_the_tangent_space_before_it(carried: float, tmp_path: Path) -> None:
+    """As it is, by the reset of error-state filters (Solà 2017, eq. 287), or wholly; no other is."""
+    rng, space = np.random.default_rng(1), Product(attitude=SO3(), bias=Euclidean(["x", "y", "z"], "rad/s"))
+    up, R = np.array([0.0, 0.6, 0.8]), 0.01 * np.eye(3)
+    for shrunk in (1.0, 0.9):
+        x, P = np.r_[quaternions.exp(rng.normal(0, 0.5, 3)), np.zeros(3)], np.diag([0.3, 0.03, 0.1, 0.1, 0.1, 0.1])
+        with viz_estim.record(tmp_path / "a.rrd", space) as rec:
+            for k in range(40):
+                P = P + np.diag([0.3, 0.003, 0.1, 0, 0, 0])
+                rec.stage("predict", mean=x, cov=P)
+                turned = quaternions.to_matrix(x[:4]).T @ up
+                H = np.hstack([[[0, -turned[2], turned[1]], [turned[2], 0, -turned[0]], [-turned[1], turned[0], 0]],
+                               np.zeros((3, 3))])  # fmt: skip
+                y = up + 0.1 * rng.standard_normal(3) - turned
+                S = H @ P @ H.T + R
+                K = P @ H.T @ np.linalg.inv(S)
+                A = space.transport(x, carried * (K @ y))
+                x, P = space.plus(x, K @ y), shrunk * A @ (P - K @ S @ K.T) @ A.T
+                rec.stage("up", mean=x, cov=P, residual=y, residual_cov=S, gain=K, z=up, predicted=turned, noise=R)
+                rec.step(time=0.1 * k)
+        of_claims = [f for f in found(tmp_path / "a.rrd") if f.evidence.get("kind") == "claims" or f.code == "update"]
+        assert bool(of_claims) == (shrunk < 1.0)

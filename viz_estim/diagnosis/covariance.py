@@ -6,9 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
-from viz_estim.diagnosis.evidence import Case, tells_gain
+from viz_estim.diagnosis.evidence import Case, sensor_of, tangents, tells_gain
 from viz_estim.diagnosis.finding import GROSS, Finding
 
 _HALF = float(np.sqrt(np.finfo(float).eps))  # half of the digits: what is beyond is no rounding that piled up
@@ -75,10 +76,10 @@ def epsilon(values: Array) -> float:
 def claims(case: Case) -> Iterator[Finding]:
     """An update that leaves less than a reading can: P⁺ ≥ P − C·S⁻¹·Cᵀ for any gain (Kalman's is the best).
 
-    Carried to the tangent space at the new mean. By the eigenvalues of P⁺ over that bound, which no sound update has
-    below 1 by more than rounding: half of the digits, times the ratio of the variances before and after. Over the run
-    they multiply, and are told from the factor on that as many readings can tell of a variance, 1 + √(2/N); an error
-    where in the middle one alone is GROSS.
+    In whichever of the tangent spaces (`tangents`) P⁺ is kept. By the eigenvalues of P⁺ over that bound, which no sound
+    update has below 1 by more than rounding: half of the digits, times the ratio of the variances before and after.
+    Over the run they multiply, and are told from the factor on that as many readings can tell of a variance,
+    1 + √(2/N); an error where in the middle one alone is GROSS.
     """
     for table in case.run.stages.values():
         if not {"innovation.cov", "cov"} <= table.values.keys() or not tells_gain(table):
@@ -91,16 +92,14 @@ def claims(case: Case) -> Iterator[Finding]:
         if not rows.any():
             continue
         least = before[rows] - C[rows] @ np.linalg.solve(S[rows], np.swapaxes(C[rows], 1, 2))
-        if not case.space.flat:
-            A = case.space.transport(mean[rows], case.space.minus(table.mean[rows], mean[rows]))
-            least = A @ least @ np.swapaxes(A, 1, 2)
-        least = 0.5 * (least + np.swapaxes(least, 1, 2))
-        fine = sound(least)
+        fine = sound(symmetrised(least))
         if not fine.any():
             continue
-        L = np.linalg.cholesky(least[fine])
-        inside = np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, table.cov[rows][fine]), 1, 2))
-        ratio = np.linalg.eigvalsh(0.5 * (inside + np.swapaxes(inside, 1, 2)))[:, 0]
+        moved = case.space.minus(table.mean[rows], mean[rows])[fine]
+        ratio = np.max([
+            _least_ratio(table.cov[rows][fine], A @ least[fine] @ np.swapaxes(A, 1, 2))
+            for A in tangents(case.space, mean[rows][fine], moved)
+        ], axis=0)  # fmt: skip
         shrunk = np.diagonal(before[rows][fine], axis1=1, axis2=2) / np.diagonal(least[fine], axis1=1, axis2=2)
         bad = ratio < 1 - np.minimum(_HALF * shrunk.max(1), 1 - 1 / GROSS)
         claimed = -np.log(np.maximum(ratio[bad], 1e-300)).sum()
@@ -108,13 +107,20 @@ def claims(case: Case) -> Iterator[Finding]:
             of = table.step[rows][fine][bad]
             worst = float(ratio[bad].min())
             yield Finding(
-                "covariance", "error" if GROSS * np.median(ratio[bad]) < 1 + _HALF else "warning", None,
-                (int(of[0]), int(of[-1])),
+                "covariance", "error" if GROSS * np.median(ratio[bad]) < 1 + _HALF else "warning",
+                sensor_of(table), (int(of[0]), int(of[-1])),
                 {"kind": "claims", "least_ratio": worst, "stage": table.name, "count": int(bad.sum())},
                 f"at {int(bad.sum())} updates the covariance shrinks by more than the reading can tell (down to "
                 f"{worst:.2g} of the least variance that any gain leaves)",
                 "check P⁺ = (I − K·H)·P: its gain, its S, and that it is taken off once; write it in Joseph's form",
             )  # fmt: skip
+
+
+def _least_ratio(A: Array, B: Array) -> Array:
+    """The smallest eigenvalue (M,) of B⁻¹·A; B positive definite."""
+    L = np.linalg.cholesky(symmetrised(B))
+    inside = np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, A), 1, 2))
+    return np.asarray(np.linalg.eigvalsh(symmetrised(inside))[:, 0], float)
 
 
 _WORDS = {
