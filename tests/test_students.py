@@ -69,3 +69,16 @@ def test_a_covariance_after_a_turn_may_stay_in_the_tangent_space_before_it(carri
                 rec.step(time=0.1 * k)
         of_claims = [f for f in found(tmp_path / "a.rrd") if f.evidence.get("kind") == "claims" or f.code == "update"]
         assert bool(of_claims) == (shrunk < 1.0)
+
+
+@pytest.mark.parametrize("first", [0, 12])
+def test_a_covariance_that_is_no_number_ends_no_recording_with_a_truth(first: int, tmp_path: Path) -> None:
+    path = tmp_path / "a.rrd"
+    with viz_estim.record(path, {"x": "m", "v": "m/s"}) as rec:
+        for k in range(20):
+            rec.stage("predict", mean=np.zeros(2), cov=np.eye(2) if k < first else np.full((2, 2), np.nan))
+            rec.step(time=0.1 * k, truth=np.zeros(2))
+    run = viz_estim.load(path)
+    assert len(run.step) == 20
+    assert (run.summary()["nees"] or {"mean": None})["mean"] == (0.0 if first else None)
+    assert found(path)[0].code == "failed"

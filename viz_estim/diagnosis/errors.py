@@ -40,7 +40,7 @@ def start(case: Case) -> Iterator[Finding]:
         mean, P = table.mean[-1], table.cov[-1]
     error = case.space.minus(run.truth[k], mean)
     known = np.isfinite(error) & (np.diag(P) > 0)
-    if not known.any() or np.linalg.cond(P[known][:, known]) > 1e13:
+    if not known.any() or not np.isfinite(P).all() or np.linalg.cond(P[known][:, known]) > 1e13:
         return
     value, dof = float(error[known] @ np.linalg.solve(P[known][:, known], error[known])), int(known.sum())
     severity = judge(float(chi2.sf(value, dof)), 1, large=bool(value > GROSS * dof))
@@ -128,6 +128,6 @@ def _correlation_time(white: Array) -> float:
     rho = np.fft.irfft((np.abs(spectrum) ** 2).sum(1))[:T]
     rho = rho / max(rho[0], 1e-300)
     crossed = np.flatnonzero(rho <= 0)
-    end = int(crossed[0]) if len(crossed) else T
+    end = max(1, int(crossed[0])) if len(crossed) else T  # no error at all has no ρ₀ either
     tau = float(1 + 2 * (rho[1:end] ** 2).sum())
     return tau * (1 + float(norm.isf(level("warning", 1))) * (2 * (2 * end - 1) / T) ** 0.5)
