@@ -82,3 +82,43 @@ def test_a_covariance_that_is_no_number_ends_no_recording_with_a_truth(first: in
     assert len(run.step) == 20
     assert (run.summary()["nees"] or {"mean": None})["mean"] == (0.0 if first else None)
     assert found(path)[0].code == "failed"
+
+
+def complementary(path: Path, *, unit: float = 1.0, truth: bool = True) -> Path:
+    """An attitude by a gyro alone, without a covariance."""
+    rng, q, estimate = np.random.default_rng(2), np.array([1.0, 0, 0, 0]), np.array([1.0, 0, 0, 0])
+    with viz_estim.record(path, SO3()) as rec:
+        for k in range(200):
+            if k:
+                rate = np.array([np.sin(0.05 * k), np.cos(0.03 * k), 0.5 * np.sin(0.02 * k)])
+                q = quaternions.multiply(q, quaternions.exp(0.02 * rate))
+                rate = unit * rate + 0.01 * rng.standard_normal(3)
+                estimate = quaternions.multiply(estimate, quaternions.exp(0.02 * rate))
+            rec.stage("predict", mean=estimate)
+            rec.step(time=0.02 * k, truth=q if truth else None)
+    return path
+
+
+def test_a_filter_without_a_covariance_is_recorded_and_held_against_the_truth(tmp_path: Path) -> None:
+    path = complementary(tmp_path / "a.rrd")
+    run = viz_estim.load(path)
+    assert np.isfinite(run.mean).all()
+    assert np.isnan(run.cov).all()
+    assert run.summary()["metrics"]["attitude_rmse_deg"] < 1
+    assert [(f.code, f.severity) for f in found(path)] == [("untested", "note")]
+    wrong = found(complementary(path, unit=np.pi / 180))
+    assert (wrong[0].code, wrong[0].severity) == ("process_model", "error")
+
+
+def test_where_nothing_tells_whether_a_filter_is_right_that_is_said(tmp_path: Path) -> None:
+    (note,) = found(complementary(tmp_path / "a.rrd", truth=False))
+    assert (note.code, note.severity) == ("untested", "note")
+    assert "residual" in note.remedy
+
+
+def test_a_covariance_is_told_of_at_each_stage_or_at_none(tmp_path: Path) -> None:
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        rec.stage("predict", mean=[0.0])
+        with pytest.raises(ValueError, match="stage update: a cov, but there was none before"):
+            rec.stage("update", mean=[0.0], cov=[[1.0]])
+        rec.step(time=0.0)

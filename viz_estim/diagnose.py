@@ -59,6 +59,7 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     innovations.lost,
     signatures.lags,
     signatures.biases,
+    errors.untested,
     errors.start,
     truth.sensors,
     weighing.noises,
@@ -109,7 +110,7 @@ def diagnose(run: Run) -> list[Finding]:
         for check in OF_FILTERS:
             found += check(under_test)
         odd = (*SYMPTOMS, "biased_innovation", "particles_far", "particles_collapsed")
-        if any(f.severity != "note" and f.code in odd for f in found):
+        if any(f.severity != "note" and f.code in odd for f in found) or not errors.has_covariance(under_test):
             found += motion.prediction(under_test)  # else the filter knows how wrong it is
         # Noises are tuned once nothing else is wrong: until then a factor on them would only hide it.
         causes = [f for f in ranked(found) if f.severity == "error" and f.tier <= _TIMES and f.code != "start"]
@@ -203,7 +204,8 @@ def _no_number(run: Run) -> list[Finding]:
     """A belief that was recorded as NaN or infinity, by a loop that went on nevertheless."""
     if run.labels or "particles" in run.properties:
         return []
-    lost = np.flatnonzero(~(np.isfinite(run.mean).all(1) & np.isfinite(run.cov).all((1, 2))))
+    told = run.properties.get("covariance", True)  # else it is NaN throughout
+    lost = np.flatnonzero(~(np.isfinite(run.mean).all(1) & (np.isfinite(run.cov).all((1, 2)) | (not told))))
     if not len(lost):
         return []
     step, last = int(run.step[lost[0]]), int(run.step[lost[-1]])

@@ -71,6 +71,7 @@ class Recording:
         self._failure: Failure | None = None
         self._closed = False
         self._told = 0
+        self._with_cov = True  # a covariance is told of
         self._tally: Tally
 
     def stage(
@@ -94,8 +95,9 @@ class Recording:
         blind: ArrayLike | None = None,
         **numbers: ArrayLike,
     ) -> None:
-        """The belief after a stage: mean (n,) and cov (d, d); or particles' states (N, n) with weights or log_weights
-        (N,); or probabilities (K,) of the labels.
+        """The belief after a stage: mean (n,) and cov (d, d), the mean alone of a filter that has no covariance; or
+        particles' states (N, n) with weights or log_weights (N,); or probabilities (K,) of the labels. Call a
+        prediction `predict`, or `predict_…`: by that name its motion is held against the truth's.
 
         Of an update also the residual (m,), its covariance S (m, m) and the gain (d, m); if known, the reading z, what
         was predicted, the noise R (m, m), whether it was used or gated, and the direction (d,) that it is blind to.
@@ -237,6 +239,7 @@ class Recording:
             "seed": None,
             "data": [],
             "calibration": None,
+            "covariance": self._with_cov,
             "versions": {name: version(name) for name in ("viz-estim", "rerun-sdk", "numpy")}
             | {"python": platform.python_version()},
             "first": 0,
@@ -257,10 +260,15 @@ class Recording:
             belief = told.categorical(where, plain, probabilities)
         elif states is not None:
             belief = told.particles(where, self._space, states, weights, log_weights)
-        elif mean is None or cov is None:
-            raise ValueError(f"{where}: give mean and cov together")
+        elif mean is None:
+            raise ValueError(f"{where}: give the mean with cov")
         else:
             belief = told.gaussian(where, self._space, mean, cov)
+            if self._belief is not None and self._with_cov != (cov is not None):
+                raise ValueError(
+                    f"{where}: {'no cov, but there was one' if self._with_cov else 'a cov, but there was none'} before"
+                )
+            self._with_cov = cov is not None
         if self._belief is not None and (type(belief), belief.shapes) != (type(self._belief), self._belief.shapes):
             if isinstance(belief, Particles) and isinstance(self._belief, Particles):
                 now, then = (len(one.log_weights) for one in (belief, self._belief))

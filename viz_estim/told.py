@@ -49,11 +49,12 @@ def state_of(names: Names) -> Space:
     return Product(**parts)
 
 
-def gaussian(where: str, space: Space | None, mean: ArrayLike, cov: ArrayLike) -> Gaussian:
-    """N(mean (n,), cov (d, d)); without a space its components are x0, x1, …."""
-    x, P = _number(f"{where}: mean", mean).reshape(-1), np.atleast_2d(_number(f"{where}: cov", cov))
+def gaussian(where: str, space: Space | None, mean: ArrayLike, cov: ArrayLike | None) -> Gaussian:
+    """N(mean (n,), cov (d, d)), of NaN where there is none; without a space its components are x0, x1, …."""
+    x = _number(f"{where}: mean", mean).reshape(-1)
     space = space or Euclidean([f"x{i}" for i in range(len(x))])
     n, d = len(space.names), len(space.axes)
+    P = np.full((d, d), np.nan) if cov is None else np.atleast_2d(_number(f"{where}: cov", cov))
     fits(f"{where}: mean", x, (n,))
     fits(f"{where}: cov", P, (d, d))
     return Gaussian(space, x, P)

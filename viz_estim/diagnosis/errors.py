@@ -20,6 +20,33 @@ _FEWEST = 10
 _AT_FIRST = 0.05  # of the run: how late the first error may be known that is still told of as the start's; no rate
 
 
+def has_covariance(case: Case) -> bool:
+    """Whether a filter says how sure it is: by a covariance that is neither absent nor zero throughout."""
+    if case.run.labels or "cov" not in case.run.ends:
+        return True  # by probabilities
+    return bool((np.nan_to_num(case.run.cov) != 0).any())
+
+
+def untested(case: Case) -> Iterator[Finding]:
+    """Neither innovations nor errors that could be held against a covariance: silence would look like health."""
+    run = case.run
+    if run.labels or case.sensors or run.error or run.properties.get("belief") == "Particles" or is_registration(case):
+        return
+    if "mean" not in run.ends or not np.isfinite(run.mean).all(1).any():
+        return
+    truth, sure = np.isfinite(run.truth).any(), has_covariance(case)
+    if truth and sure:
+        return
+    tell = "tell `rec.stage` the residual and residual_cov of each update, with z, noise and gain"
+    yield Finding(
+        "untested", "note", None, case.whole, {"truth": bool(truth), "covariance": sure},
+        "no covariance is recorded, and no innovation: the errors against the truth are what they are, and what the "
+        "filter believes of them is not known" if truth else
+        "neither innovations nor a truth are recorded: nothing tells whether the estimate is right",
+        f"{tell}, and the covariance" if truth else f"{tell}; or tell `rec.step` the truth, where there is one",
+    )  # fmt: skip
+
+
 def start(case: Case) -> Iterator[Finding]:
     """The error of the first belief against its covariance: eᵀ·P⁻¹·e is χ² of as many components as have a truth.
 

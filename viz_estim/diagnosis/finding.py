@@ -51,6 +51,7 @@ CODES = {
     "particles_far": "no particle is where the readings are",
     "particles_clamped": "particles are held at a bound",
     "several_modes": "the particles form several clouds, between which the mean lies",
+    "untested": "nothing that is recorded tells whether the filter is right",
     "icp_not_converged": "the iterations ended before the matches repeated",
     "icp_few_matches": "hardly any points have a match",
     "icp_rmse_rises": "the matches' RMSE rises while their number does not",
