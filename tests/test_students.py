@@ -10,6 +10,7 @@ from viz_estim.core import quaternions
 from viz_estim.core.spaces import SO3, Euclidean, Product
 from viz_estim.diagnose import diagnose
 from viz_estim.diagnosis.finding import Finding
+from viz_estim.recordings import Recording
 
 
 def found(path: Path) -> list[Finding]:
@@ -122,3 +123,31 @@ def test_a_covariance_is_told_of_at_each_stage_or_at_none(tmp_path: Path) -> Non
         with pytest.raises(ValueError, match="stage update: a cov, but there was none before"):
             rec.stage("update", mean=[0.0], cov=[[1.0]])
         rec.step(time=0.0)
+
+
+def steps(rec: Recording, count: int, value: float = 0.0) -> None:
+    for k in range(count):
+        rec.stage("predict", mean=[value], cov=[[1.0]])
+        rec.step(time=float(k))
+
+
+def test_a_recording_goes_where_it_began_and_a_later_one_of_its_name_ends_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rec = viz_estim.record("a.rrd")
+    steps(rec, 3)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    rec.close()
+    assert len(viz_estim.load(tmp_path / "a.rrd").step) == 3
+    monkeypatch.chdir(tmp_path)
+    first = viz_estim.record("a.rrd")  # a notebook's cell, run twice
+    steps(first, 4)
+    second = viz_estim.record("a.rrd")
+    steps(second, 5, 1.0)
+    with pytest.raises(ValueError, match=r"a\.rrd: this recording is closed"):
+        first.stage("predict", mean=[0.0], cov=[[1.0]])
+    first.close()
+    second.close()
+    assert viz_estim.load("a.rrd").mean.tolist() == [[1.0]] * 5

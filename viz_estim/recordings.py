@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from viz_estim import told
+from viz_estim import opened, told
 from viz_estim.core.beliefs import Belief, Categorical, Particles
 from viz_estim.core.consistency import Tally
 from viz_estim.core.quaternions import Array
@@ -56,7 +56,7 @@ class Recording:
 
     def __init__(self, path: Path, space: told.Names | None, sensors: Mapping[str, told.Names]) -> None:
         check_writable(path, suffix=".rrd")
-        self.path = path
+        self.path, self._file = path, path.resolve()  # also where the program goes to another folder
         self._space: Space | None = None if space is None else told.state_of(space)
         self._labels: tuple[str, ...] = ()
         self._sensors = {name: told.space_of(names) for name, names in sensors.items()}
@@ -69,10 +69,10 @@ class Recording:
         self._count = 0
         self._recorder: Recorder | None = None
         self._failure: Failure | None = None
-        self._closed = False
-        self._told = 0
+        self._closed, self._told, self._has_truth = False, 0, False
         self._with_cov = True  # a covariance is told of
         self._tally: Tally
+        opened.begin(self, self._file)
 
     def stage(
         self,
@@ -144,21 +144,13 @@ class Recording:
         Whether a truth is drawn is settled by the first step: give one there, of NaN if it is not known yet.
         """
         self._check_open()
-        if isinstance(time, np.ndarray) and time.size == 1:
-            time = time.item()
-        if not isinstance(time, (int, float, np.number)):
-            raise ValueError(f"step {self._count}: expected a time in seconds, got {type(time).__name__}")
-        if not np.isfinite(time) or (self._times and time < self._times[-1]):
-            raise ValueError(f"step {self._count}: its time {time} is not after the last one's")
+        time = told.seconds(f"step {self._count}", time, self._times[-1] if self._times else -np.inf)
         if not self._stages:
             raise ValueError(f"step {self._count}: tell of a stage before the step ends")
-        if isinstance(truth, str):
-            if truth not in self._labels:
-                raise ValueError(f"step {self._count}: truth {truth}: expected one of {', '.join(self._labels)}")
-            truth = self._labels.index(truth)
-        true = None if truth is None else told.vector(truth)
-        if true is not None:
-            told.fits(f"step {self._count}: truth", true, (1 if self._space is None else len(self._space.names),))
+        true = told.truth(f"step {self._count}: truth", self._labels, self._space, truth)
+        if self._count and true is not None and not self._has_truth:
+            raise ValueError(f"step {self._count}: a truth, but the first step had none; give that one of NaN")
+        self._has_truth |= true is not None
         dt = time - self._times[-1] if self._times else 0.0
         tick = Tick(float(time), dt, None if control is None else told.vector(control), dict(self._readings))
         self._times.append(float(time))
@@ -169,11 +161,12 @@ class Recording:
     def fail(self, error: BaseException, stage: str = "") -> None:
         """Ends the run with what was raised, in the step that is not ended, and in the stage of that name."""
         last = self._stages[-1].name if self._stages else ""
-        text = f"{type(error).__name__}: {error}"
-        self._failure = Failure(self._count, stage or (f"after {last}" if last else "first"), text)
+        where = stage or (f"after {last}" if last else "first")
+        self._failure = Failure(self._count, where, f"{type(error).__name__}: {error}")
 
     def close(self) -> None:
         """Ends the recording; stages that no step ended are one at the time that would have come next."""
+        opened.end(self, self._file)
         untold = self._failure and self._failure.step == self._count
         if self._stages or (untold and self._recorder):
             gap = self._times[-1] - self._times[-2] if len(self._times) > 1 else 0.0
@@ -244,7 +237,7 @@ class Recording:
             | {"python": platform.python_version()},
             "first": 0,
         }
-        self._recorder = Recorder(self.path, scenario, properties)
+        self._recorder = Recorder(self._file, scenario, properties)
 
     def _believed(
         self, where: str, mean: ArrayLike | None, cov: ArrayLike | None, states: ArrayLike | None,

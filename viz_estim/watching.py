@@ -6,7 +6,6 @@ and whatever goes wrong in recording them is told once, and is no exception in a
 
 from __future__ import annotations
 
-import atexit
 import functools
 import sys
 from collections.abc import Callable, Hashable, Mapping
@@ -55,7 +54,6 @@ def watch(
     for one, kind in zip(filters, kinds, strict=True):
         assert kind
         kind(one, recording, dt)
-    atexit.register(recording.close)
     return recording
 
 
@@ -122,7 +120,6 @@ class Watched(Recording):
         for undo in self._undo:
             undo()
         self._undo = []
-        atexit.unregister(self.close)
         if self._stages and self.now is not None:
             self.step(time=max(self.now, self._times[-1] if self._times else self.now))
         super().close()
