@@ -671,6 +671,25 @@ def test_watching_costs_no_program_its_run(tmp_path: Path, capsys: pytest.Captur
     assert "predict" not in vars(kf)
 
 
+def test_a_watched_filter_s_model_and_control_are_recorded(tmp_path: Path) -> None:
+    kf = linear()
+    kf.B, kf.Q = np.array([[0.0], [0.1]]), 1.0 * np.eye(2)  # a hundred times too much
+    rec = viz_estim.watch(kf, path=tmp_path / "a.rrd", space=STATE, dt=0.1, sensors={"z": {"place": "m"}})
+    rng, true = np.random.default_rng(0), np.zeros(2)
+    for k in range(300):
+        u = np.sin(0.1 * k)
+        true = F @ true + kf.B[:, 0] * u + 0.1 * rng.standard_normal(2)
+        kf.predict(u=np.array([[u]]))
+        kf.update(true[:1] + 0.5 * rng.standard_normal(1))
+    rec.close()
+    run = viz_estim.load(tmp_path / "a.rrd")
+    np.testing.assert_array_equal(run.stages["predict"].values["transition"][0], F)
+    np.testing.assert_allclose(run.inputs["control"][1:, 0], np.sin(0.1 * np.arange(300)))
+    assert run.stages["update"].spaces["innovation"].names == ("z.place",)
+    (first, *_) = [f for f in diagnose(run) if f.code == "underconfident"]
+    assert "multiply Q by about 0.0" in first.remedy
+
+
 def test_one_line_is_all_that_a_person_s_program_needs(tmp_path: Path) -> None:
     program = """
 from filterpy.kalman import KalmanFilter

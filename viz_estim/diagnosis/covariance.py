@@ -161,6 +161,8 @@ def bounds(case: Case) -> Iterator[Finding]:
         return
     ends = rows[np.linspace(len(rows) // 2, len(rows) - 1, 5).astype(int)]
     elapsed = run.time[ends] - run.time[rows[0]]
+    if not (np.diff(elapsed) > 0).all():
+        return  # stamps that stand still tell of no rate
     fastest = (elapsed[1:] / np.maximum(elapsed[:-1], 1e-12)) ** -(len(case.space.axes) - 0.5)
     for name in case.space.parts:
         axes, at = case.space.axes_at[name], case.space.at[name]
