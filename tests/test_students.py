@@ -151,3 +151,42 @@ def test_a_recording_goes_where_it_began_and_a_later_one_of_its_name_ends_it(
     first.close()
     second.close()
     assert viz_estim.load("a.rrd").mean.tolist() == [[1.0]] * 5
+
+
+@pytest.mark.parametrize("unit", ["", "rad", "deg"])
+@pytest.mark.parametrize("wrapped", [True, False])
+def test_a_bearing_that_jumps_by_a_turn_is_no_outlier(unit: str, wrapped: bool, tmp_path: Path) -> None:
+    rng, x, P, turn = np.random.default_rng(3), np.array([2.5]), np.eye(1), 360.0 if unit == "deg" else 2 * np.pi
+    x, scale = x * turn / (2 * np.pi), turn / (2 * np.pi)
+    with viz_estim.record(tmp_path / "a.rrd", ["heading"], sensors={"compass": {"bearing": unit}}) as rec:
+        for k in range(100):
+            P = P + (0.05 * scale) ** 2
+            rec.stage("predict", mean=x, cov=P)
+            z = (2.5 + 0.02 * k + 0.05 * rng.standard_normal(1)) * scale
+            z = (z + turn / 2) % turn - turn / 2
+            y, S = z - x, P + (0.05 * scale) ** 2
+            y = (y + turn / 2) % turn - turn / 2 if wrapped else y
+            x, P, K = x + P / S @ y, P - P @ P / S, P / S
+            if wrapped:
+                x = (x + turn / 2) % turn - turn / 2
+            noise = (0.05 * scale) ** 2
+            rec.stage("update", mean=x, cov=P, residual=y, residual_cov=S, gain=K, z=z, predicted=z - y, noise=noise,
+                      sensor="compass")  # fmt: skip
+            rec.step(time=0.1 * k)
+    codes = [f.code for f in found(tmp_path / "a.rrd") if f.severity == "error"]
+    assert codes[:1] == ([] if wrapped else ["angle_wrap"])
+
+
+def test_a_start_that_the_first_readings_deny_is_no_matter_of_a_gate(tmp_path: Path) -> None:
+    rng, x, P = np.random.default_rng(4), np.array([3.0]), np.array([[0.01]])
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        for k in range(200):
+            P = P + 0.01
+            rec.stage("predict", mean=x, cov=P)
+            y, S = 0.1 * rng.standard_normal(1) - x, P + 0.01
+            x, P = x + P / S @ y, P - P @ P / S
+            rec.stage("update", mean=x, cov=P, residual=y, residual_cov=S, gain=P / 0.01, noise=0.01)
+            rec.step(time=0.1 * k)
+    (first,) = [f for f in found(tmp_path / "a.rrd") if f.code == "outliers"]
+    assert "starts elsewhere" in first.cause
+    assert "set no gate" in first.remedy
