@@ -190,3 +190,27 @@ def test_a_start_that_the_first_readings_deny_is_no_matter_of_a_gate(tmp_path: P
     (first,) = [f for f in found(tmp_path / "a.rrd") if f.code == "outliers"]
     assert "starts elsewhere" in first.cause
     assert "set no gate" in first.remedy
+
+
+def test_gravity_of_the_wrong_sign_is_named(tmp_path: Path) -> None:
+    """By the speed that it changes and not by the place that follows."""
+    rng, dt = np.random.default_rng(5), 0.1
+    F, Q = np.array([[1.0, dt], [0.0, 1.0]]), np.diag([1e-6, 1e-4])
+    H, true, x, P = np.array([[1.0, 0.0]]), np.zeros(2), np.zeros(2), np.eye(2)
+    with viz_estim.record(tmp_path / "a.rrd", {"height": "m", "speed": "m/s"}) as rec:
+        for k in range(200):
+            force = 9.81 + np.sin(0.1 * k)
+            if k:
+                true = F @ true + np.array([0.5 * dt * dt, dt]) * (force - 9.81)
+                x = F @ x + np.array([0.5 * dt * dt, dt]) * (force + 9.81)
+                P = F @ P @ F.T + Q
+                rec.stage("predict", mean=x, cov=P, transition=F, noise=Q)
+            z = true[:1] + 0.1 * rng.standard_normal(1)
+            S = H @ P @ H.T + 0.01
+            K, y = P @ H.T / S, z - H @ x
+            x, P = x + K @ y, P - K @ S @ K.T
+            rec.stage("update", mean=x, cov=P, residual=y, residual_cov=S, gain=K, z=z, noise=0.01)
+            rec.step(time=dt * k, truth=true, control=force)
+    first = found(tmp_path / "a.rrd")[0]
+    assert (first.code, first.evidence["component"]) == ("process_model", "state speed")
+    assert "gravity is added with the wrong sign" in first.cause

@@ -19,6 +19,7 @@ from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.covariance import epsilon, sound
+from viz_estim.diagnosis.doubled import LINE, doubled
 from viz_estim.diagnosis.evidence import Case, sensor_of, tangents, tells_gain, tells_reading
 from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, Severity
 from viz_estim.recording.tables import StageTable
@@ -60,11 +61,9 @@ def updates(case: Case) -> Iterator[Finding]:
             points = any(key.endswith(".points") for key in table.values)
             reading = tells_reading(table.values["innovation.predicted"])
             lines = [
-                _spread(told, points),
-                _gain(told),
-                _mean(told),
+                _spread(told, points), _gain(told), _twice(told), _mean(told),
                 _added(told, _noise(case, told.step), list(case.space.axes_at.values())) or _cov(told),
-            ]
+            ]  # fmt: skip
             found = [_residual(told) if reading else None, *lines]
             for severity, what, cause, remedy in [one for one in found if one][:1]:
                 steps = int(told.step[0]), int(told.step[-1])
@@ -185,6 +184,10 @@ def _mean(told: Told) -> _Line | None:
             "those that are recorded", "move it by K·ν once, with the K and ν of this update",
         )  # fmt: skip
     return None
+
+
+def _twice(told: Told) -> _Line | None:
+    return LINE if doubled(told.P, told.C, told.S, told.R, told.after, _left(told)) else None
 
 
 def _cov(told: Told) -> _Line | None:
