@@ -97,7 +97,8 @@ class Recording:
     ) -> None:
         """The belief after a stage: mean (n,) and cov (d, d), the mean alone of a filter that has no covariance; or
         particles' states (N, n) with weights or log_weights (N,); or probabilities (K,) of the labels. Call a
-        prediction `predict`, or `predict_…`: by that name its motion is held against the truth's.
+        prediction `predict`, or `predict_…`: by that name its motion is held against the truth's; and the first belief
+        `start`.
 
         Of an update also the residual (m,), its covariance S (m, m) and the gain (d, m); if known, the reading z, what
         was predicted, the noise R (m, m), whether it was used or gated, and the direction (d,) that it is blind to.

@@ -71,6 +71,10 @@ def start(case: Case) -> Iterator[Finding]:
         return
     value, dof = float(error[known] @ np.linalg.solve(P[known][:, known], error[known])), int(known.sum())
     severity = judge(float(chi2.sf(value, dof)), 1, large=bool(value > GROSS * dof))
+    last = case.run.at(int(run.step[k]))[-1][0] if table is None else None  # the stage that the belief is of
+    if severity and last is not None and "innovation.residual" in last.values:
+        # It was moved already, and a first reading of something bent may leave less than it can tell.
+        severity = "warning"
     if severity:
         sigma = np.where(known, np.abs(error) / np.sqrt(np.where(known, np.diag(P), 1.0)), 0.0)
         worst = int(np.argmax(sigma))
@@ -78,8 +82,10 @@ def start(case: Case) -> Iterator[Finding]:
         yield Finding(
             "start", severity, None, (step, step),
             {"component": name, "error": float(error[worst]), "sigma": float(sigma[worst]), "nees": value, "dof": dof},
-            f"the filter starts {sigma[worst]:.2g}σ off the truth, most of all in {name} ({error[worst]:+.3g} {unit})",
-            f"start it nearer, or with a standard deviation of {name} of about {abs(error[worst]):.2g} {unit}",
+            f"{'the filter starts' if last is None else f'after its first {last.name} the filter is'} "
+            f"{sigma[worst]:.2g}σ off the truth, most of all in {name} ({error[worst]:+.3g} {unit})",
+            f"start it nearer, or with a standard deviation of {name} of about {abs(error[worst]):.2g} {unit}"
+            + (", and record the first belief as a stage `start`, to see which of them is off" if last else ""),
         )  # fmt: skip
 
 

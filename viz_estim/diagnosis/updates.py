@@ -60,8 +60,9 @@ def updates(case: Case) -> Iterator[Finding]:
         if tells_gain(table) and (told := _told(case, table)) is not None:
             points = any(key.endswith(".points") for key in table.values)
             reading = tells_reading(table.values["innovation.predicted"])
+            twice = LINE if doubled(told.P, told.C, told.S, told.R, told.after, _left(told)) else None
             lines = [
-                _spread(told, points), _gain(told), _twice(told), _mean(told),
+                _spread(told, points), _gain(told), twice, _mean(told),
                 _added(told, _noise(case, told.step), list(case.space.axes_at.values())) or _cov(told),
             ]  # fmt: skip
             found = [_residual(told) if reading else None, *lines]
@@ -184,10 +185,6 @@ def _mean(told: Told) -> _Line | None:
             "those that are recorded", "move it by K·ν once, with the K and ν of this update",
         )  # fmt: skip
     return None
-
-
-def _twice(told: Told) -> _Line | None:
-    return LINE if doubled(told.P, told.C, told.S, told.R, told.after, _left(told)) else None
 
 
 def _cov(told: Told) -> _Line | None:
