@@ -214,3 +214,17 @@ def test_gravity_of_the_wrong_sign_is_named(tmp_path: Path) -> None:
     first = found(tmp_path / "a.rrd")[0]
     assert (first.code, first.evidence["component"]) == ("process_model", "state speed")
     assert "gravity is added with the wrong sign" in first.cause
+
+
+def test_a_prediction_without_noise_is_named_where_readings_deny_it(tmp_path: Path) -> None:
+    rng, true, x, P = np.random.default_rng(6), 0.0, np.zeros(1), np.eye(1)
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        for k in range(200):
+            true += 0.2 * rng.standard_normal()
+            rec.stage("predict", mean=x, cov=P, transition=np.eye(1), noise=np.zeros((1, 1)))
+            y, S = true + 0.1 * rng.standard_normal(1) - x, P + 0.01
+            K = P / S
+            x, P = x + K @ y, P - K @ P
+            rec.stage("update", mean=x, cov=P, residual=y, residual_cov=S, gain=K, noise=0.01)
+            rec.step(time=0.1 * k)
+    assert "Q of the prediction is zero" in found(tmp_path / "a.rrd")[0].cause

@@ -111,6 +111,9 @@ def _elsewhere(case: Case) -> Iterator[Finding]:
         told_of: list[tuple[float, Finding]] = []
         for i, axis in enumerate("xyz"):
             told_of += _moves_as(f"{name} {axis}", "rad", of, truly[:, i] - told[:, i], told[:, i], one, none, 6)
+        if any(list(part.axis_units) == ["rad/s"] * 3 for part in case.space.parts.values()):
+            # A bias that is part of the state may have been taught by wrong readings, and drifts as it says.
+            told_of = [entry for entry in told_of if "drift" not in entry[1].evidence]
         yield from _best(told_of)
     if (moved := clouds.moves_of_means(case)) is not None:
         yield from _of_a_cloud(case, moved)
