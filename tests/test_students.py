@@ -228,3 +228,26 @@ def test_a_prediction_without_noise_is_named_where_readings_deny_it(tmp_path: Pa
             rec.stage("update", mean=x, cov=P, residual=y, residual_cov=S, gain=K, noise=0.01)
             rec.step(time=0.1 * k)
     assert "Q of the prediction is zero" in found(tmp_path / "a.rrd")[0].cause
+
+
+@pytest.mark.parametrize("wrong", ["", "forgotten", "drawn"])
+def test_weights_follow_from_what_they_are_made_of(wrong: str, tmp_path: Path) -> None:
+    rng, N, true = np.random.default_rng(7), 100, 0.0
+    x, w = rng.standard_normal(N), np.full(N, 1 / N)
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        for k in range(40):
+            true += 0.3 * rng.standard_normal()
+            x = x + 0.3 * rng.standard_normal(N)
+            rec.stage("predict", states=x, weights=w)
+            z = true + 0.3 * rng.standard_normal()
+            logs = -0.5 * ((z - x) / 0.3) ** 2
+            w = np.exp(logs - logs.max()) * (1 if wrong == "forgotten" else w)
+            w = w / w.sum()
+            rec.stage("weigh", states=x, weights=w, log_likelihoods=logs, z=z)
+            if 1 / (w**2).sum() < 0.4 * N:
+                of = rng.integers(0, N, N) if wrong == "drawn" else rng.choice(N, N, p=w)
+                x, w = x[of], np.full(N, 1 / N)
+                rec.stage("resample", states=x, weights=w, ancestors=of)
+            rec.step(time=0.1 * k)
+    told = [f.evidence["kind"] for f in found(tmp_path / "a.rrd") if f.code == "weights"]
+    assert told == ([wrong] if wrong else [])

@@ -32,6 +32,7 @@ from viz_estim.diagnosis import (
     truth,
     updates,
     weighing,
+    weights,
 )  # fmt: skip
 from viz_estim.diagnosis.evidence import Case, case
 from viz_estim.diagnosis.finding import CODES, SYMPTOMS, Finding
@@ -80,6 +81,8 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     durations.carried,
     copies.together,
     copies.weighed_again,
+    weights.forgotten,
+    weights.drawn,
     particles.collapsed,
     particles.clamped,
     particles.far,

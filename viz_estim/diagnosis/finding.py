@@ -47,6 +47,7 @@ CODES = {
     "start": "the first belief is further from the truth than its covariance says",
     "jacobian": "a Jacobian is not the derivative of the model that it stands for",
     "noisy_prediction": "the prediction moves the mean at random: a sample of the noise was added to it",
+    "weights": "particles' weights do not follow from what they are made of, or copies not from the weights",
     "particles_collapsed": "hardly any distinct particles or weights are left",
     "particles_far": "no particle is where the readings are",
     "particles_clamped": "particles are held at a bound",
