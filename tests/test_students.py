@@ -251,3 +251,20 @@ def test_weights_follow_from_what_they_are_made_of(wrong: str, tmp_path: Path) -
             rec.step(time=0.1 * k)
     told = [f.evidence["kind"] for f in found(tmp_path / "a.rrd") if f.code == "weights"]
     assert told == ([wrong] if wrong else [])
+
+
+@pytest.mark.parametrize("read", [True, False])
+def test_a_variance_that_grows_with_the_distance_is_not_unread(read: bool, tmp_path: Path) -> None:
+    rng, true, x, P = np.random.default_rng(8), 0.0, np.zeros(1), np.eye(1)
+    with viz_estim.record(tmp_path / "a.rrd", ["x"]) as rec:
+        for k in range(200):
+            true += rng.standard_normal()
+            P = P + 1.0
+            rec.stage("predict", mean=x, cov=P)
+            R = np.array([[0.01 * (k + 1.0) ** 2 if read else 1e14]])
+            y, S = true + np.sqrt(R[0]) * rng.standard_normal(1) - x, P + R
+            K = P / S
+            x, P = x + K @ y, P - K @ P
+            rec.stage("update", mean=x, cov=P, residual=y, residual_cov=S, gain=K, noise=R)
+            rec.step(time=0.1 * k)
+    assert [f.evidence.get("kind") for f in found(tmp_path / "a.rrd")] == ([] if read else ["growing"])

@@ -181,6 +181,7 @@ def bounds(case: Case) -> Iterator[Finding]:
             (gains[1:] > (1 - _HALF) * gains[:-1]).all()
             and gains[0] > 0
             and sigma[rows[-1]] ** 2 > GROSS * sigma[rows[0]] ** 2
+            and not _told_of(case, axes, int(run.step[ends[0]]))
         ):
             evidence = {
                 "kind": "growing", "part": name, "start": float(sigma[rows[0]]), "end": float(sigma[rows[-1]])
@@ -190,6 +191,19 @@ def bounds(case: Case) -> Iterator[Finding]:
                 f"the covariance of {name} grows without bound: no sensor tells of it",
                 f"if a sensor should see {name}, check its Jacobian; else this is dead reckoning, and honest",
             )  # fmt: skip
+
+
+def _told_of(case: Case, axes: slice, since: int) -> bool:
+    """Whether updates from a step on take off a part's variance: by GROSS in all, as where it is read from ever further
+    away."""
+    gained = 0.0
+    for table in case.run.stages.values():
+        if "innovation.cov" in table.values and "cov" in table.values:
+            before = np.diagonal(case.sequence.before(table)[1], axis1=1, axis2=2)[table.step >= since, axes]
+            after = np.diagonal(table.cov, axis1=1, axis2=2)[table.step >= since, axes]
+            rows = (before > 0).all(1) & (after > 0).all(1)
+            gained += float(np.log(before[rows] / after[rows]).max(1).sum())
+    return gained > np.log(GROSS)
 
 
 def unobservable(case: Case) -> Iterator[Finding]:
