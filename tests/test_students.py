@@ -268,3 +268,26 @@ def test_a_variance_that_grows_with_the_distance_is_not_unread(read: bool, tmp_p
             rec.stage("update", mean=x, cov=P, residual=y, residual_cov=S, gain=K, noise=R)
             rec.step(time=0.1 * k)
     assert [f.evidence.get("kind") for f in found(tmp_path / "a.rrd")] == ([] if read else ["growing"])
+
+
+@pytest.mark.parametrize("control", [True, False])
+def test_a_control_that_follows_the_state_makes_no_jacobian_wrong(control: bool, tmp_path: Path) -> None:
+    rng, dt = np.random.default_rng(9), 0.1
+    F, B, Q = np.array([[1.0, dt], [0.0, 1.0]]), np.array([0.0, dt]), 1e-3 * np.eye(2)
+    H, true, x, P = np.array([[1.0, 0.0]]), np.array([3.0, 0.0]), np.array([3.0, 0.0]), 0.1 * np.eye(2)
+    with viz_estim.record(tmp_path / "a.rrd") as rec:
+        for k in range(200):
+            u = -1.0 * x[0] - 1.5 * x[1]
+            if k:
+                true = F @ true + B * u + np.sqrt(1e-3) * rng.standard_normal(2)
+                x, P = F @ x + B * u, F @ P @ F.T + Q
+                rec.stage("predict", mean=x, cov=P, transition=F, noise=Q)
+            z = true[:1] + 0.1 * rng.standard_normal(1)
+            y, S = z - x[:1], H @ P @ H.T + 0.01
+            K = P @ H.T / S
+            x, P = x + K @ y, P - K @ S @ K.T
+            rec.stage("update", mean=x, cov=P, residual=y, residual_cov=S, gain=K, z=z, noise=0.01)
+            rec.step(time=dt * k, control=u if control else None)
+    told = found(tmp_path / "a.rrd")
+    assert [(f.code, f.severity) for f in told] == ([] if control else [("jacobian", "warning")])
+    assert control or "control" in told[0].cause + told[0].remedy
