@@ -33,7 +33,7 @@ def space_of(names: Names) -> Space:
     """The geometry itself, or of plain names, with their units where they are a dict."""
     if hasattr(names, "plus"):
         return names  # type: ignore[return-value]
-    if not isinstance(names, Mapping | Sequence | np.ndarray) or (
+    if not isinstance(names, (Mapping, Sequence, np.ndarray)) or (
         not isinstance(names, str) and not all(isinstance(name, str) for name in names)
     ):
         raise ValueError(

@@ -130,7 +130,7 @@ class FilterPy:
         """F and Q of a linear prediction; NaN of one that leaves the covariance alone."""
         F, Q = (getattr(self.kf, k, None) if given.get(k) is None else given[k] for k in ("F", "Q"))
         n = np.size(self.kf.x)
-        if np.shape(F) != (n, n) or Q is None or np.shape(Q) not in ((), (n, n)):
+        if F is None or Q is None or np.shape(F) != (n, n) or np.shape(Q) not in ((), (n, n)):
             return {}
         share = 1.0 if method == "predict" else np.nan
         return {

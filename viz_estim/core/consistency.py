@@ -140,7 +140,7 @@ def nees(space: Space, mean: Array, cov: Array, truth: Array) -> tuple[Array, in
     if len(directions) == 0 or not rows.any():
         return values, len(directions)
     P = cov[np.ix_(np.flatnonzero(rows), directions, directions)]
-    sound = np.isfinite(P).all((1, 2))
+    sound: np.ndarray = np.asarray(np.isfinite(P).all((1, 2)))
     sound[sound] = np.linalg.cond(P[sound]) < 1e15
     at = np.flatnonzero(rows)[sound]
     values[at] = squared_distance(error[at][:, directions], P[sound])

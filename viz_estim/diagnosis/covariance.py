@@ -119,7 +119,7 @@ def claims(case: Case) -> Iterator[Finding]:
 def _least_ratio(A: Array, B: Array) -> Array:
     """The smallest eigenvalue (M,) of B⁻¹·A; B positive definite."""
     L = np.linalg.cholesky(symmetrised(B))
-    inside = np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, A), 1, 2))
+    inside = np.asarray(np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, A), 1, 2)), float)
     return np.asarray(np.linalg.eigvalsh(symmetrised(inside))[:, 0], float)
 
 

@@ -107,7 +107,8 @@ def _apart(A: Array, B: Array) -> Array:
     """By what factor (M,) A and B differ in the direction in which they do most; inf where B⁻¹·A is not positive."""
     L = np.linalg.cholesky(symmetrised(B))
     half = np.linalg.solve(L, symmetrised(A))
-    values = np.linalg.eigvalsh(symmetrised(np.linalg.solve(L, np.swapaxes(half, 1, 2))))
+    inside = np.asarray(np.linalg.solve(L, np.swapaxes(half, 1, 2)), float)
+    values = np.linalg.eigvalsh(symmetrised(inside))
     low, high = values[:, 0], values[:, -1]
     return np.maximum(high, 1 / np.maximum(low, 1e-300))
 
