@@ -124,6 +124,8 @@ def by_part(case: Case) -> Iterator[Finding]:
         evidence = {"part": name, "mean_nees": mean, "dof": dof, "independent": independent, "p": p}
         code = "overconfident" if ratio > 1 else "underconfident"
         what = f"the error of {name} is {times(ratio**0.5)} as large as its covariance says"
+        if ratio * np.finfo(float).eps > 1:  # of a cloud of copies
+            what = f"the covariance of {name} is as good as zero beside its error"
         if ratio > 1:
             why, remedy = _too_sure(case, name)
             cause = f"{what}: {why}"
