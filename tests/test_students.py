@@ -1,5 +1,6 @@
 """Filters as their authors write and record them: sound ones are left alone, and what is not told is not judged."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -291,3 +292,13 @@ def test_a_control_that_follows_the_state_makes_no_jacobian_wrong(control: bool,
     told = found(tmp_path / "a.rrd")
     assert [(f.code, f.severity) for f in told] == ([] if control else [("jacobian", "warning")])
     assert control or "control" in told[0].cause + told[0].remedy
+
+
+def test_particles_that_are_all_but_copies_make_no_warning(tmp_path: Path) -> None:
+    states = 1e-155 * np.array([[0.0, 0.0], [1.0, 0.9], [-1.0, -1.1]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with viz_estim.record(tmp_path / "a.rrd") as rec:
+            for k in range(3):
+                rec.stage("predict", states=states)
+                rec.step(time=k, truth=[1.0, 1.0])

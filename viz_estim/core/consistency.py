@@ -143,7 +143,8 @@ def nees(space: Space, mean: Array, cov: Array, truth: Array) -> tuple[Array, in
     sound: np.ndarray = np.asarray(np.isfinite(P).all((1, 2)))
     sound[sound] = np.linalg.cond(P[sound]) < 1e15
     at = np.flatnonzero(rows)[sound]
-    values[at] = squared_distance(error[at][:, directions], P[sound])
+    with np.errstate(over="ignore", invalid="ignore"):  # of particles that are all but copies
+        values[at] = squared_distance(error[at][:, directions], P[sound])
     return values, len(directions)
 
 
