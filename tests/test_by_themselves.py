@@ -115,7 +115,10 @@ def test_a_covariance_that_shrinks_as_readings_allow_has_not_collapsed() -> None
     ):
         cov = shape[:, None, None] * np.eye(2)
         ends = recorded.ends | {"cov": cov}
-        assert kinds(evidence.case(replace(recorded, ends=ends)), covariance.bounds) == found_kinds
+        unread = replace(recorded, ends=ends, stages={})  # its updates are of another covariance
+        case = replace(evidence.case(recorded), run=unread)
+        assert kinds(case, covariance.bounds) == found_kinds
+        assert kinds(replace(case, run=replace(unread, time=np.zeros(n))), covariance.bounds) == []
 
 
 def test_one_reading_given_as_two_is_told_and_two_that_are_alike_are_not() -> None:

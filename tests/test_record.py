@@ -21,6 +21,7 @@ from filterpy.kalman import (  # type: ignore[import-untyped]
 )
 from PIL import Image
 from rerun.chunk import RrdReader
+from scipy.sparse import csr_array
 
 import viz_estim
 from viz_estim import told
@@ -424,6 +425,27 @@ BAD: dict[str, tuple[Callable[[Any], object], str]] = {
         lambda rec: [rec.stage("p", mean=[1, 2], cov=np.eye(2)), rec.step(time=-1)],
         "time -1 is not after",
     ),
+    "a time in nanoseconds": (
+        lambda rec: [rec.stage("p", mean=[1, 2], cov=np.eye(2)), rec.step(time=1_700_000_000_000_000_000)],
+        "is none in seconds; divide ns by 1e9",
+    ),
+    "a truth that comes late": (
+        lambda rec: [rec.stage("p", mean=[1, 2], cov=np.eye(2)), rec.step(time=1, truth=[1, 2])],
+        "step 1: a truth, but the first step had none; give that one of NaN",
+    ),
+    "a reading of another length": (
+        lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), residual=[1], residual_cov=1, z=[1, 2]),
+        "z: expected the shape (1,), got (2,)",
+    ),
+    "a misspelt number": (
+        lambda rec: rec.stage("p", mean=[1, 2], cov=np.eye(2), residuals=[1]), "residuals: did you mean residual?"
+    ),
+    "a complex covariance": (
+        lambda rec: rec.stage("p", mean=[1, 2], cov=1j * np.eye(2)), "stage p: cov: expected real numbers, got complex"
+    ),
+    "a state that grows": (
+        lambda rec: rec.stage("p", mean=[1, 2, 3], cov=np.eye(3)), "a state keeps its size: give what is not there yet"
+    ),
     "a truth of another length": (
         lambda rec: [rec.stage("p", mean=[1, 2], cov=np.eye(2)), rec.step(time=1, truth=[1])],
         "truth: expected",
@@ -649,6 +671,25 @@ def test_watching_costs_no_program_its_run(tmp_path: Path, capsys: pytest.Captur
     assert "predict" not in vars(kf)
 
 
+def test_a_watched_filter_s_model_and_control_are_recorded(tmp_path: Path) -> None:
+    kf = linear()
+    kf.B, kf.Q = np.array([[0.0], [0.1]]), 1.0 * np.eye(2)  # a hundred times too much
+    rec = viz_estim.watch(kf, path=tmp_path / "a.rrd", space=STATE, dt=0.1, sensors={"z": {"place": "m"}})
+    rng, true = np.random.default_rng(0), np.zeros(2)
+    for k in range(300):
+        u = np.sin(0.1 * k)
+        true = F @ true + kf.B[:, 0] * u + 0.1 * rng.standard_normal(2)
+        kf.predict(u=np.array([[u]]))
+        kf.update(true[:1] + 0.5 * rng.standard_normal(1))
+    rec.close()
+    run = viz_estim.load(tmp_path / "a.rrd")
+    np.testing.assert_array_equal(run.stages["predict"].values["transition"][0], F)
+    np.testing.assert_allclose(run.inputs["control"][1:, 0], np.sin(0.1 * np.arange(300)))
+    assert run.stages["update"].spaces["innovation"].names == ("z.place",)
+    (first, *_) = [f for f in diagnose(run) if f.code == "underconfident"]
+    assert "multiply Q by about 0.0" in first.remedy
+
+
 def test_one_line_is_all_that_a_person_s_program_needs(tmp_path: Path) -> None:
     program = """
 from filterpy.kalman import KalmanFilter
@@ -656,15 +697,19 @@ import viz_estim
 kf = KalmanFilter(1, 1)
 kf.H[:] = 1
 viz_estim.watch(kf)
+beside = viz_estim.record("beside.rrd")
 for z in range(50):
     kf.predict()
     kf.update(z)
+    beside.stage("copy", mean=kf.x, cov=kf.P)
+    beside.step(time=z)
 """
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", program], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
-    run = viz_estim.load(tmp_path / "recordings" / "KalmanFilter.rrd")
-    assert run.complete
-    assert len(run.step) == 51
+    for name, steps in (("recordings/KalmanFilter.rrd", 51), ("beside.rrd", 50)):  # though nobody closes them
+        run = viz_estim.load(tmp_path / name)
+        assert run.complete
+        assert len(run.step) == steps
 
 
 def test_what_cannot_be_watched_is_refused(tmp_path: Path) -> None:
@@ -794,3 +839,29 @@ def test_a_loop_that_goes_on_with_nan_is_no_healthy_one(where: str, tmp_path: Pa
     first = diagnose(viz_estim.load(tmp_path / "a.rrd"))[0]
     assert (first.code, first.severity, first.steps) == ("failed", "error", (12, 19))
     assert "after predict" in first.cause
+
+
+def test_names_that_are_not_told_apart_are_refused(tmp_path: Path) -> None:
+    for space, words in ((["x", "x"], "x is there twice"), (5, "expected names"), ([1, 2], "expected names")):
+        with pytest.raises(ValueError, match=words):
+            viz_estim.record(tmp_path / "a.rrd", space)  # type: ignore[arg-type]
+    with viz_estim.record(tmp_path / "a.rrd", np.array(["x", "v"])) as rec:  # type: ignore[arg-type]
+        rec.stage("predict", mean=[0, 1], cov=csr_array(np.eye(2)))
+        rec.step(time=0)
+    run = viz_estim.load(tmp_path / "a.rrd")
+    assert run.space.names == ("x", "v")
+    np.testing.assert_array_equal(run.cov, [np.eye(2)])
+
+
+def test_a_truth_that_knows_some_components_alone_is_kept_by_parts(tmp_path: Path) -> None:
+    with viz_estim.record(tmp_path / "a.rrd", STATE) as rec:
+        rec.stage("predict", mean=[0, 1], cov=np.eye(2))
+        with pytest.raises(ValueError, match=r"step 0: truth: x is known and v is not.*space=Product\("):
+            rec.step(time=0, truth=[1, np.nan])
+    space = Product(place=Euclidean(["x"], "m"), speed=Euclidean(["v"], "m/s"))
+    with viz_estim.record(tmp_path / "a.rrd", space) as rec:
+        rec.stage("predict", mean=[0, 1], cov=np.eye(2))
+        rec.step(time=0, truth=[1, np.nan])
+    run = viz_estim.load(tmp_path / "a.rrd")
+    np.testing.assert_array_equal(run.truth, [[1, np.nan]])
+    assert run.summary()["nees"]["mean"] == 1.0

@@ -46,6 +46,15 @@ def redone(before: Gaussian, stage: Update, **numbers: Array) -> Update:
     return replace(stage, belief=belief, gain=K, innovation=replace(innovation, cov=S, residual=residual))
 
 
+def again(before: Gaussian, stage: Update) -> Update:
+    """The update with the reading's information added twice."""
+    innovation = stage.innovation
+    informs = np.linalg.solve(before.cov, innovation.cross_cov) @ np.linalg.inv(innovation.noise)  # Hᵀ·R⁻¹
+    H = np.linalg.solve(before.cov, innovation.cross_cov).T
+    cov = np.linalg.inv(np.linalg.inv(before.cov) + 2 * informs @ H)
+    return redone(before, stage, cov=cov, moved=2 * cov @ informs @ innovation.residual)
+
+
 WRONG: dict[str, tuple[str, Change]] = {
     "ẑ − z": ("residual", lambda b, u: redone(b, u, residual=-u.innovation.residual)),
     "noise R of the reading is missing": ("S", lambda b, u: redone(b, u, S=u.innovation.cov - u.innovation.noise)),
@@ -57,6 +66,7 @@ WRONG: dict[str, tuple[str, Change]] = {
     "2× as far": ("mean", lambda b, u: redone(b, u, moved=2 * u.gain @ u.innovation.residual)),
     "is the one before it": ("covariance", lambda b, u: redone(b, u, cov=b.cov)),
     "(I + K·H)": ("covariance", lambda b, u: redone(b, u, cov=b.cov + u.gain @ u.innovation.cross_cov.T)),
+    "taken in twice": ("twice", again),
     "process noise Q": ("covariance", lambda b, u: redone(b, u, cov=u.belief.cov + np.diag([0.1, 0.1, 0, 0]))),
 }  # fmt: skip
 

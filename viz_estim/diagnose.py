@@ -24,6 +24,7 @@ from viz_estim.diagnosis import (
     motion,
     particles,
     places,
+    predictions,
     repeats,
     sensors,
     signatures,
@@ -31,6 +32,7 @@ from viz_estim.diagnosis import (
     truth,
     updates,
     weighing,
+    weights,
 )  # fmt: skip
 from viz_estim.diagnosis.evidence import Case, case
 from viz_estim.diagnosis.finding import CODES, SYMPTOMS, Finding
@@ -58,6 +60,7 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     innovations.lost,
     signatures.lags,
     signatures.biases,
+    errors.untested,
     errors.start,
     truth.sensors,
     weighing.noises,
@@ -65,6 +68,7 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     errors.by_part,
     covariance.broken,
     updates.updates,
+    predictions.predictions,
     covariance.claims,
     covariance.bounds,
     covariance.unobservable,
@@ -77,6 +81,8 @@ OF_FILTERS: tuple[Callable[[Case], Iterator[Finding]], ...] = (
     durations.carried,
     copies.together,
     copies.weighed_again,
+    weights.forgotten,
+    weights.drawn,
     particles.collapsed,
     particles.clamped,
     particles.far,
@@ -107,7 +113,7 @@ def diagnose(run: Run) -> list[Finding]:
         for check in OF_FILTERS:
             found += check(under_test)
         odd = (*SYMPTOMS, "biased_innovation", "particles_far", "particles_collapsed")
-        if any(f.severity != "note" and f.code in odd for f in found):
+        if any(f.severity != "note" and f.code in odd for f in found) or not errors.has_covariance(under_test):
             found += motion.prediction(under_test)  # else the filter knows how wrong it is
         # Noises are tuned once nothing else is wrong: until then a factor on them would only hide it.
         causes = [f for f in ranked(found) if f.severity == "error" and f.tier <= _TIMES and f.code != "start"]
@@ -201,7 +207,8 @@ def _no_number(run: Run) -> list[Finding]:
     """A belief that was recorded as NaN or infinity, by a loop that went on nevertheless."""
     if run.labels or "particles" in run.properties:
         return []
-    lost = np.flatnonzero(~(np.isfinite(run.mean).all(1) & np.isfinite(run.cov).all((1, 2))))
+    told = run.properties.get("covariance", True)  # else it is NaN throughout
+    lost = np.flatnonzero(~(np.isfinite(run.mean).all(1) & (np.isfinite(run.cov).all((1, 2)) | (not told))))
     if not len(lost):
         return []
     step, last = int(run.step[lost[0]]), int(run.step[lost[-1]])

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from viz_estim import told
+from viz_estim import opened, told
 from viz_estim.core.beliefs import Belief, Categorical, Particles
 from viz_estim.core.consistency import Tally
 from viz_estim.core.quaternions import Array
@@ -56,7 +56,7 @@ class Recording:
 
     def __init__(self, path: Path, space: told.Names | None, sensors: Mapping[str, told.Names]) -> None:
         check_writable(path, suffix=".rrd")
-        self.path = path
+        self.path, self._file = path, path.resolve()  # also where the program goes to another folder
         self._space: Space | None = None if space is None else told.state_of(space)
         self._labels: tuple[str, ...] = ()
         self._sensors = {name: told.space_of(names) for name, names in sensors.items()}
@@ -69,9 +69,10 @@ class Recording:
         self._count = 0
         self._recorder: Recorder | None = None
         self._failure: Failure | None = None
-        self._closed = False
-        self._told = 0
+        self._closed, self._told, self._has_truth = False, 0, False
+        self._with_cov = True  # a covariance is told of
         self._tally: Tally
+        opened.begin(self, self._file)
 
     def stage(
         self,
@@ -94,8 +95,10 @@ class Recording:
         blind: ArrayLike | None = None,
         **numbers: ArrayLike,
     ) -> None:
-        """The belief after a stage: mean (n,) and cov (d, d); or particles' states (N, n) with weights or log_weights
-        (N,); or probabilities (K,) of the labels.
+        """The belief after a stage: mean (n,) and cov (d, d), the mean alone of a filter that has no covariance; or
+        particles' states (N, n) with weights or log_weights (N,); or probabilities (K,) of the labels. Call a
+        prediction `predict`, or `predict_…`: by that name its motion is held against the truth's; and the first belief
+        `start`.
 
         Of an update also the residual (m,), its covariance S (m, m) and the gain (d, m); if known, the reading z, what
         was predicted, the noise R (m, m), whether it was used or gated, and the direction (d,) that it is blind to.
@@ -142,21 +145,13 @@ class Recording:
         Whether a truth is drawn is settled by the first step: give one there, of NaN if it is not known yet.
         """
         self._check_open()
-        if isinstance(time, np.ndarray) and time.size == 1:
-            time = time.item()
-        if not isinstance(time, (int, float, np.number)):
-            raise ValueError(f"step {self._count}: expected a time in seconds, got {type(time).__name__}")
-        if not np.isfinite(time) or (self._times and time < self._times[-1]):
-            raise ValueError(f"step {self._count}: its time {time} is not after the last one's")
+        time = told.seconds(f"step {self._count}", time, self._times[-1] if self._times else -np.inf)
         if not self._stages:
             raise ValueError(f"step {self._count}: tell of a stage before the step ends")
-        if isinstance(truth, str):
-            if truth not in self._labels:
-                raise ValueError(f"step {self._count}: truth {truth}: expected one of {', '.join(self._labels)}")
-            truth = self._labels.index(truth)
-        true = None if truth is None else told.vector(truth)
-        if true is not None:
-            told.fits(f"step {self._count}: truth", true, (1 if self._space is None else len(self._space.names),))
+        true = told.truth(f"step {self._count}: truth", self._labels, self._space, truth)
+        if self._count and true is not None and not self._has_truth:
+            raise ValueError(f"step {self._count}: a truth, but the first step had none; give that one of NaN")
+        self._has_truth |= true is not None
         dt = time - self._times[-1] if self._times else 0.0
         tick = Tick(float(time), dt, None if control is None else told.vector(control), dict(self._readings))
         self._times.append(float(time))
@@ -167,11 +162,12 @@ class Recording:
     def fail(self, error: BaseException, stage: str = "") -> None:
         """Ends the run with what was raised, in the step that is not ended, and in the stage of that name."""
         last = self._stages[-1].name if self._stages else ""
-        text = f"{type(error).__name__}: {error}"
-        self._failure = Failure(self._count, stage or (f"after {last}" if last else "first"), text)
+        where = stage or (f"after {last}" if last else "first")
+        self._failure = Failure(self._count, where, f"{type(error).__name__}: {error}")
 
     def close(self) -> None:
         """Ends the recording; stages that no step ended are one at the time that would have come next."""
+        opened.end(self, self._file)
         untold = self._failure and self._failure.step == self._count
         if self._stages or (untold and self._recorder):
             gap = self._times[-1] - self._times[-2] if len(self._times) > 1 else 0.0
@@ -237,11 +233,12 @@ class Recording:
             "seed": None,
             "data": [],
             "calibration": None,
+            "covariance": self._with_cov,
             "versions": {name: version(name) for name in ("viz-estim", "rerun-sdk", "numpy")}
             | {"python": platform.python_version()},
             "first": 0,
         }
-        self._recorder = Recorder(self.path, scenario, properties)
+        self._recorder = Recorder(self._file, scenario, properties)
 
     def _believed(
         self, where: str, mean: ArrayLike | None, cov: ArrayLike | None, states: ArrayLike | None,
@@ -257,10 +254,15 @@ class Recording:
             belief = told.categorical(where, plain, probabilities)
         elif states is not None:
             belief = told.particles(where, self._space, states, weights, log_weights)
-        elif mean is None or cov is None:
-            raise ValueError(f"{where}: give mean and cov together")
+        elif mean is None:
+            raise ValueError(f"{where}: give the mean with cov")
         else:
             belief = told.gaussian(where, self._space, mean, cov)
+            if self._belief is not None and self._with_cov != (cov is not None):
+                raise ValueError(
+                    f"{where}: {'no cov, but there was one' if self._with_cov else 'a cov, but there was none'} before"
+                )
+            self._with_cov = cov is not None
         if self._belief is not None and (type(belief), belief.shapes) != (type(self._belief), self._belief.shapes):
             if isinstance(belief, Particles) and isinstance(self._belief, Particles):
                 now, then = (len(one.log_weights) for one in (belief, self._belief))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from functools import cache
 from typing import Any
 
@@ -19,16 +21,30 @@ from viz_estim.core.stages import Innovation, Resample, SigmaPoints, Stage
 
 Names = Space | Mapping[str, str] | Sequence[str]
 _HEADINGS = ("heading", "theta", "yaw", "psi", "θ", "ψ")
+_NUMBERS = (
+    "mean", "states", "weights", "log_weights", "probabilities", "residual", "residual_cov", "gain", "sensor",
+    "predicted", "noise", "transition", "log_likelihoods", "ancestors",
+)  # fmt: skip
+_LONGEST = 2.0**63 / 1e9  # s: 292 years, as much as a recording's nanoseconds hold
 POINTS = ("sigma", "drawn", "propagated", "mapped")  # numbers of a stage that are points; the last in the reading
 
 
 def space_of(names: Names) -> Space:
     """The geometry itself, or of plain names, with their units where they are a dict."""
+    if hasattr(names, "plus"):
+        return names  # type: ignore[return-value]
+    if not isinstance(names, (Mapping, Sequence, np.ndarray)) or (
+        not isinstance(names, str) and not all(isinstance(name, str) for name in names)
+    ):
+        raise ValueError(
+            f"{names!r:.60}: expected names such as ('x', 'y'), with units {{'x': 'm', 'y': 'm'}}, or a space"
+        )
+    twice = [name for name, count in Counter(list(names)).items() if count > 1 and not isinstance(names, str)]
+    if twice:
+        raise ValueError(f"{twice[0]} is there twice: give each component a name of its own")
     if isinstance(names, Mapping):
         return Euclidean(list(names), list(names.values()))
-    if isinstance(names, Sequence):
-        return Euclidean(names)
-    return names
+    return Euclidean(names if isinstance(names, str) else list(names))
 
 
 def state_of(names: Names) -> Space:
@@ -49,12 +65,17 @@ def state_of(names: Names) -> Space:
     return Product(**parts)
 
 
-def gaussian(where: str, space: Space | None, mean: ArrayLike, cov: ArrayLike) -> Gaussian:
-    """N(mean (n,), cov (d, d)); without a space its components are x0, x1, …."""
-    x, P = _number(f"{where}: mean", mean).reshape(-1), np.atleast_2d(_number(f"{where}: cov", cov))
+def gaussian(where: str, space: Space | None, mean: ArrayLike, cov: ArrayLike | None) -> Gaussian:
+    """N(mean (n,), cov (d, d)), of NaN where there is none; without a space its components are x0, x1, …."""
+    x = _number(f"{where}: mean", mean).reshape(-1)
     space = space or Euclidean([f"x{i}" for i in range(len(x))])
     n, d = len(space.names), len(space.axes)
-    fits(f"{where}: mean", x, (n,))
+    P = np.full((d, d), np.nan) if cov is None else np.atleast_2d(_number(f"{where}: cov", cov))
+    if len(x) != n:
+        raise ValueError(
+            f"{where}: mean: expected the shape ({n},), got ({len(x)},); a state keeps its size: give what is not "
+            "there yet, such as a landmark, a variance that is very large"
+        )
     fits(f"{where}: cov", P, (d, d))
     return Gaussian(space, x, P)
 
@@ -120,8 +141,10 @@ def innovation(
     flat = n == m
     guess = ν if expected is None else space.plus(expected, ν)
     reading = guess if z is None else vector(z)
-    if len(reading) != n:
-        reading = ν if flat else np.full(n, np.nan)
+    if z is not None:
+        fits(f"{where}: z", reading, (n,))
+    elif len(reading) != n:
+        reading = np.full(n, np.nan)
     if expected is None:
         expected = reading - ν if flat else reading
     fits(f"{where}: predicted", expected, (n,))
@@ -156,6 +179,8 @@ def others(
     for name, values in numbers.items():
         if not re.fullmatch(r"[a-z]\w*", name) or name in ("belief", "innovation"):
             raise ValueError(f"{where}: {name} cannot be a number's name")
+        if name not in POINTS and (meant := get_close_matches(name, _NUMBERS, 1, 0.85)) and name != meant[0]:
+            raise ValueError(f"{where}: {name}: did you mean {meant[0]}? A figure of your own needs another name")
         if name in POINTS:
             space = reading if name == "mapped" and reading else getattr(belief, "space", None)
             found[name] = _points(f"{where}: {name}", space, values)
@@ -193,11 +218,51 @@ def _evidence(logs: Array) -> Array:
     return np.asarray(best + np.log(np.exp(logs - best).sum()) if np.isfinite(best) else np.nan)
 
 
-def _number(what: str, values: ArrayLike) -> Array:
+def _number(what: str, values: Any) -> Array:
+    if hasattr(values, "toarray"):  # of scipy.sparse
+        values = values.toarray()
+    if np.iscomplexobj(values) and np.imag(values).any():
+        raise ValueError(f"{what}: expected real numbers, got complex ones")
     try:
-        return np.array(values, float)
+        return np.array(np.real(values) if np.iscomplexobj(values) else values, float)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{what}: expected numbers, got {values!r:.60}") from error
+
+
+def seconds(where: str, time: Any, last: float) -> float:
+    """A step's time, not before the last one's."""
+    if isinstance(time, np.ndarray) and time.size == 1:
+        time = time.item()
+    if not isinstance(time, (int, float, np.number)) or isinstance(time, np.timedelta64):
+        stamp = "" if isinstance(time, (np.ndarray, str)) else "; of stamps it is (t − t0).total_seconds()"
+        raise ValueError(f"{where}: expected a time in seconds, got {type(time).__name__}{stamp}")
+    if not abs(time) < _LONGEST:
+        raise ValueError(f"{where}: its time {time} is none in seconds; divide ns by 1e9, and ms by 1000")
+    if time < last:
+        raise ValueError(f"{where}: its time {time} is not after the last one's, {last}")
+    return float(time)
+
+
+def truth(where: str, labels: tuple[str, ...], space: Space | None, values: ArrayLike | str | None) -> Array | None:
+    """The true state (n,), or the index (1,) of the true label; None where it is not told."""
+    if isinstance(values, str):
+        if values not in labels:
+            raise ValueError(f"{where}: {values}: expected one of {', '.join(labels)}")
+        values = labels.index(values)
+    if values is None:
+        return None
+    true = vector(values)
+    fits(where, true, (1 if space is None else len(space.names),))
+    parts = space.at.values() if isinstance(space, Product) else [slice(None)]
+    for at in parts:
+        known = np.isfinite(true[at])
+        if space is not None and known.any() and not known.all():
+            names = np.array(space.names)[at]
+            raise ValueError(
+                f"{where}: {names[known][0]} is known and {names[~known][0]} is not, but a part's truth is kept whole; "
+                "make parts of them, space=Product(a=Euclidean([…]), b=Euclidean([…]))"
+            )
+    return true
 
 
 def vector(values: ArrayLike) -> Array:

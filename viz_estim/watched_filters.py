@@ -78,7 +78,8 @@ class FilterPy:
 
     def _predicted(self, method: str, given: dict[str, Any]) -> None:
         self._move_on(given.get("dt"))
-        self.recording.stage("predict", mean=self.kf.x, cov=self.kf.P, **self._figures())
+        self.recording.control = given.get("u")
+        self.recording.stage("predict", mean=self.kf.x, cov=self.kf.P, **self._figures(), **self._model(method, given))
 
     def _updated(self, method: str, given: dict[str, Any]) -> None:
         if given.get("z") is None:
@@ -124,6 +125,18 @@ class FilterPy:
         H = getattr(self.kf, "H", None) if H is None else H
         pattern = np.zeros(0) if H is None or np.ndim(H) == 0 else np.asarray(H)
         return m, (pattern != 0).tobytes()
+
+    def _model(self, method: str, given: dict[str, Any]) -> dict[str, Any]:
+        """F and Q of a linear prediction; NaN of one that leaves the covariance alone."""
+        F, Q = (getattr(self.kf, k, None) if given.get(k) is None else given[k] for k in ("F", "Q"))
+        n = np.size(self.kf.x)
+        if F is None or Q is None or np.shape(F) != (n, n) or np.shape(Q) not in ((), (n, n)):
+            return {}
+        share = 1.0 if method == "predict" else np.nan
+        return {
+            "transition": share * np.asarray(F, float),
+            "noise": share * np.eye(n) * Q if np.ndim(Q) == 0 else share * np.asarray(Q, float),
+        }
 
     def _figures(self) -> dict[str, Any]:
         """Probabilities of the models among which it chooses, where it does."""

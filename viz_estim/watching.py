@@ -6,7 +6,6 @@ and whatever goes wrong in recording them is told once, and is no exception in a
 
 from __future__ import annotations
 
-import atexit
 import functools
 import sys
 from collections.abc import Callable, Hashable, Mapping
@@ -23,13 +22,15 @@ _MARK = "_viz_estim_recording"
 
 
 def watch(
-    *filters: Any, path: str | Path | None = None, space: Names | None = None, dt: float | None = None
-) -> Recording:
+    *filters: Any, path: str | Path | None = None, space: Names | None = None, dt: float | None = None,
+    sensors: Mapping[str, Names] | None = None,
+) -> Recording:  # fmt: skip
     """Records a filter of FilterPy's kind (an object with x, P, predict and update), or Stone Soup's predictor and
     updater, from here on; `close` ends the recording, or the end of the program.
 
     A step is a prediction with the updates after it. path: recordings/TYPE.rrd unless given; space: names, units and
-    geometry of the state as in `record`; dt: seconds from one prediction to the next, of a filter that does not say.
+    geometry of the state as in `record`; dt: seconds from one prediction to the next, of a filter that does not say;
+    sensors: the readings' names and units as in `record`, by `z`, `z2`, … in the order in which they first come.
     ValueError where an object is neither. Watched again, a filter begins a new recording.
     """
     from viz_estim.watched_filters import of_filterpy, of_stonesoup
@@ -51,11 +52,10 @@ def watch(
                 earlier.close()
     path = Path(path) if path else Path("recordings") / f"{type(filters[0]).__name__}.rrd"
     path.parent.mkdir(parents=True, exist_ok=True)
-    recording = Watched(path, space, {})
+    recording = Watched(path, space, sensors or {})
     for one, kind in zip(filters, kinds, strict=True):
         assert kind
         kind(one, recording, dt)
-    atexit.register(recording.close)
     return recording
 
 
@@ -67,6 +67,7 @@ class Watched(Recording):
     def __init__(self, path: Path, space: Names | None, sensors: Mapping[str, Names]) -> None:
         super().__init__(path, space, sensors)
         self.now: float | None = None  # the time of the step that is not ended
+        self.control: ArrayLike | None = None  # of that step
         self.origin: Any = None  # the first time stamp, of a library that has them
         self._undo: list[Callable[[], None]] = []
         self._known: list[Hashable] = []  # sensors, in the order in which they came
@@ -99,8 +100,8 @@ class Watched(Recording):
     def begin(self, time: float) -> None:
         """A step begins: the one before, if any, has ended."""
         if self._stages and self.now is not None:
-            self.step(time=self.now)
-        self.now = time
+            self.step(time=self.now, control=self.control)
+        self.now, self.control = time, None
 
     def sensor(self, key: Hashable) -> tuple[str, str]:
         """The names of an update's stage and its sensor: the first sensor's plain, those of others numbered."""
@@ -122,9 +123,8 @@ class Watched(Recording):
         for undo in self._undo:
             undo()
         self._undo = []
-        atexit.unregister(self.close)
         if self._stages and self.now is not None:
-            self.step(time=max(self.now, self._times[-1] if self._times else self.now))
+            self.step(time=max(self.now, self._times[-1] if self._times else self.now), control=self.control)
         super().close()
 
     def _try(self, function: Callable[..., None], *args: Any, **kwargs: Any) -> None:

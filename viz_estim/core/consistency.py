@@ -130,7 +130,7 @@ def nis(space: Product, residual: Array, cov: Array, offered: np.ndarray) -> dic
 def nees(space: Space, mean: Array, cov: Array, truth: Array) -> tuple[Array, int]:
     """Normalised estimation error squared (T,) over the parts of the state that have a truth, and its χ² dof.
 
-    NaN at steps without truth, or where the covariance of those parts is singular.
+    NaN at steps without truth, or where the covariance of those parts is singular or no number.
     """
     error = space.minus(mean, truth)
     known = np.isfinite(error)
@@ -140,9 +140,11 @@ def nees(space: Space, mean: Array, cov: Array, truth: Array) -> tuple[Array, in
     if len(directions) == 0 or not rows.any():
         return values, len(directions)
     P = cov[np.ix_(np.flatnonzero(rows), directions, directions)]
-    sound = np.linalg.cond(P) < 1e15
+    sound: np.ndarray = np.asarray(np.isfinite(P).all((1, 2)))
+    sound[sound] = np.linalg.cond(P[sound]) < 1e15
     at = np.flatnonzero(rows)[sound]
-    values[at] = squared_distance(error[at][:, directions], P[sound])
+    with np.errstate(over="ignore", invalid="ignore"):  # of particles that are all but copies
+        values[at] = squared_distance(error[at][:, directions], P[sound])
     return values, len(directions)
 
 

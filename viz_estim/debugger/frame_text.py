@@ -63,8 +63,9 @@ def _error_words(frame: Frame) -> Iterator[str]:
         if part and part.axes and part.axes[0] and np.isfinite(part.value).all():
             size = float(np.sqrt((part.value**2).sum()))
             std = frame.quantity("std").part(group) if group else frame.quantity("std")
-            worst = float(np.abs(part.value / np.maximum(std.value, 1e-300)).max()) if std else np.nan
-            yield f"error{f' {group}' if group else ''} {_number(size, part.axes[0].units[0])} ({worst:.2g}σ)"
+            sure = std is not None and bool((std.value > 0).all())  # else the covariance is zero, or absent
+            by = f" ({float(np.abs(part.value / std.value).max()):.2g}σ)" if std and sure else ""
+            yield f"error{f' {group}' if group else ''} {_number(size, part.axes[0].units[0])}{by}"
     if (nees := _one(frame, "nees")) is not None:
         yield f"NEES {nees:.3g}"
 
@@ -169,10 +170,14 @@ def _by_likelihood(frame: Frame, terms: Array) -> Iterator[str]:
 
 def _moves(moved: Array, std: Array, axis: Axis) -> str:
     """The directions that were moved, those moved most first, none that was moved a hundred times less."""
-    in_sigma = moved / np.maximum(std, np.finfo(float).tiny)
+    sure = bool((std > 0).all())  # else the covariance is zero, or absent
+    in_sigma = moved / std if sure else moved
     size = np.abs(in_sigma)
     order = [i for i in np.argsort(-size)[:4].tolist() if size[i] >= 0.01 * size.max()]
-    cells = (f"{axis.names[i]} {moved[i]:+.3g} {axis.units[i]}".rstrip() + f" ({in_sigma[i]:+.2g}σ)" for i in order)
+    cells = (
+        f"{axis.names[i]} {moved[i]:+.3g} {axis.units[i]}".rstrip() + (f" ({in_sigma[i]:+.2g}σ)" if sure else "")
+        for i in order
+    )
     return "  ".join(cells)
 
 

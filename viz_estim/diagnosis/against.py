@@ -22,6 +22,7 @@ from viz_estim.recording.layout import leaves
 
 FEWEST = 30
 _TURNED = 0.1  # rad
+_HALF = float(np.finfo(float).eps) ** -0.5  # of the digits, as a ratio
 
 
 def against(case: Case) -> list[Against]:
@@ -68,7 +69,9 @@ def _against(case: Case) -> Iterator[Against]:
                 change, told_of, bound = line
                 moved = np.where(told_of[rows, None], np.einsum("tij,tj->ti", H[rows][:, axes], change[rows]), 0.0)
                 scale = np.linalg.inv(np.linalg.cholesky(R[rows]))
-                off = np.where(told_of[rows], bound(scale @ H[rows][:, axes], rows), np.inf)
+                # H is known to half of its digits: of an error beyond that r would be rounding.
+                held = told_of[rows] & (np.linalg.norm(np.einsum("tij,tj->ti", scale, moved), axis=1) < _HALF)
+                off = np.where(held, bound(scale @ H[rows][:, axes], rows), np.inf)
                 r, true = residual[rows][:, axes] - moved, part.plus(expected, moved)
             near = np.asarray(np.isfinite(off))
             if near.sum() >= FEWEST:

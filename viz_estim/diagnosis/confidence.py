@@ -194,6 +194,12 @@ def _astray(ratio: float, rho: float) -> bool:
     return rho > 0 and 1 - rho**2 < 1 / _GROSS_Q and ratio > GROSS * _GROSS_Q
 
 
+def _no_process_noise(case: Case) -> bool:
+    """Whether predictions say that they add none."""
+    told = [t.values["noise"] for t in case.run.stages.values() if {"transition", "noise"} <= t.values.keys()]
+    return bool(told) and not any(np.nan_to_num(Q).any() for Q in told)
+
+
 def _words(
     case: Case, readings: Readings, ratio: float, factor: float | None, process: float | None, rho: float
 ) -> tuple[str, str]:
@@ -212,6 +218,12 @@ def _words(
         tuned = f"no R alone would explain it: look at the process noise of what {name} sees"
     else:
         tuned = f"set {where} to about {now * factor**0.5:.2g} (it is {now:.2g})"
+    if ratio > 1 and rho > 0 and _no_process_noise(case):
+        return (
+            f"{size}, and the process noise Q of the prediction is zero: the filter is ever surer of its model, and "
+            f"takes less and less from {name}",
+            "give the prediction the noise of what its model leaves out, Q > 0; tune the others after",
+        )
     if _astray(ratio, rho):
         return (
             f"{size}, and each is like the one before (autocorrelation {rho:.2f}): the estimate goes another way than "

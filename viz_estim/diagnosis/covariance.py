@@ -6,9 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
-from viz_estim.diagnosis.evidence import Case, tells_gain
+from viz_estim.diagnosis.evidence import Case, sensor_of, tangents, tells_gain
 from viz_estim.diagnosis.finding import GROSS, HALF_THE_DIGITS, SOLVABLE, Finding
 
 
@@ -73,10 +74,10 @@ def epsilon(values: Array) -> float:
 def claims(case: Case) -> Iterator[Finding]:
     """An update that leaves less than a reading can: P⁺ ≥ P − C·S⁻¹·Cᵀ for any gain (Kalman's is the best).
 
-    Carried to the tangent space at the new mean. By the eigenvalues of P⁺ over that bound, which no sound update has
-    below 1 by more than rounding: half of the digits, times the ratio of the variances before and after. Over the run
-    they multiply, and are told from the factor on that as many readings can tell of a variance, 1 + √(2/N); an error
-    where in the middle one alone is GROSS.
+    In whichever of the tangent spaces (`tangents`) P⁺ is kept. By the eigenvalues of P⁺ over that bound, which no sound
+    update has below 1 by more than rounding: half of the digits, times the ratio of the variances before and after.
+    Over the run they multiply, and are told from the factor on that as many readings can tell of a variance,
+    1 + √(2/N); an error where in the middle one alone is GROSS.
     """
     for table in case.run.stages.values():
         if not {"innovation.cov", "cov"} <= table.values.keys() or not tells_gain(table):
@@ -89,16 +90,14 @@ def claims(case: Case) -> Iterator[Finding]:
         if not rows.any():
             continue
         least = before[rows] - C[rows] @ np.linalg.solve(S[rows], np.swapaxes(C[rows], 1, 2))
-        if not case.space.flat:
-            A = case.space.transport(mean[rows], case.space.minus(table.mean[rows], mean[rows]))
-            least = A @ least @ np.swapaxes(A, 1, 2)
-        least = 0.5 * (least + np.swapaxes(least, 1, 2))
-        fine = sound(least)
+        fine = sound(symmetrised(least))
         if not fine.any():
             continue
-        L = np.linalg.cholesky(least[fine])
-        inside = np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, table.cov[rows][fine]), 1, 2))
-        ratio = np.linalg.eigvalsh(0.5 * (inside + np.swapaxes(inside, 1, 2)))[:, 0]
+        moved = case.space.minus(table.mean[rows], mean[rows])[fine]
+        ratio = np.max([
+            _least_ratio(table.cov[rows][fine], A @ least[fine] @ np.swapaxes(A, 1, 2))
+            for A in tangents(case.space, mean[rows][fine], moved)
+        ], axis=0)  # fmt: skip
         shrunk = np.diagonal(before[rows][fine], axis1=1, axis2=2) / np.diagonal(least[fine], axis1=1, axis2=2)
         bad = ratio < 1 - np.minimum(HALF_THE_DIGITS * shrunk.max(1), 1 - 1 / GROSS)
         claimed = -np.log(np.maximum(ratio[bad], 1e-300)).sum()
@@ -106,13 +105,20 @@ def claims(case: Case) -> Iterator[Finding]:
             of = table.step[rows][fine][bad]
             worst = float(ratio[bad].min())
             yield Finding(
-                "covariance", "error" if GROSS * np.median(ratio[bad]) < 1 + HALF_THE_DIGITS else "warning", None,
-                (int(of[0]), int(of[-1])),
+                "covariance", "error" if GROSS * np.median(ratio[bad]) < 1 + HALF_THE_DIGITS else "warning",
+                sensor_of(table), (int(of[0]), int(of[-1])),
                 {"kind": "claims", "least_ratio": worst, "stage": table.name, "count": int(bad.sum())},
                 f"at {int(bad.sum())} updates the covariance shrinks by more than the reading can tell (down to "
                 f"{worst:.2g} of the least variance that any gain leaves)",
                 "check P⁺ = (I − K·H)·P: its gain, its S, and that it is taken off once; write it in Joseph's form",
             )  # fmt: skip
+
+
+def _least_ratio(A: Array, B: Array) -> Array:
+    """The smallest eigenvalue (M,) of B⁻¹·A; B positive definite."""
+    L = np.linalg.cholesky(symmetrised(B))
+    inside = np.asarray(np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, A), 1, 2)), float)
+    return np.asarray(np.linalg.eigvalsh(symmetrised(inside))[:, 0], float)
 
 
 _WORDS = {
@@ -153,6 +159,8 @@ def bounds(case: Case) -> Iterator[Finding]:
         return
     ends = rows[np.linspace(len(rows) // 2, len(rows) - 1, 5).astype(int)]
     elapsed = run.time[ends] - run.time[rows[0]]
+    if not (np.diff(elapsed) > 0).all():
+        return  # stamps that stand still tell of no rate
     fastest = (elapsed[1:] / np.maximum(elapsed[:-1], 1e-12)) ** -(len(case.space.axes) - 0.5)
     for name in case.space.parts:
         axes, at = case.space.axes_at[name], case.space.at[name]
@@ -171,6 +179,7 @@ def bounds(case: Case) -> Iterator[Finding]:
             (gains[1:] > (1 - HALF_THE_DIGITS) * gains[:-1]).all()
             and gains[0] > 0
             and sigma[rows[-1]] ** 2 > GROSS * sigma[rows[0]] ** 2
+            and not _told_of(case, axes, int(run.step[ends[0]]))
         ):
             evidence = {
                 "kind": "growing", "part": name, "start": float(sigma[rows[0]]), "end": float(sigma[rows[-1]])
@@ -180,6 +189,19 @@ def bounds(case: Case) -> Iterator[Finding]:
                 f"the covariance of {name} grows without bound: no sensor tells of it",
                 f"if a sensor should see {name}, check its Jacobian; else this is dead reckoning, and honest",
             )  # fmt: skip
+
+
+def _told_of(case: Case, axes: slice, since: int) -> bool:
+    """Whether updates from a step on take off a part's variance: by GROSS in all, as where it is read from ever further
+    away."""
+    gained = 0.0
+    for table in case.run.stages.values():
+        if "innovation.cov" in table.values and "cov" in table.values:
+            before = np.diagonal(case.sequence.before(table)[1], axis1=1, axis2=2)[table.step >= since, axes]
+            after = np.diagonal(table.cov, axis1=1, axis2=2)[table.step >= since, axes]
+            rows = (before > 0).all(1) & (after > 0).all(1)
+            gained += float(np.log(before[rows] / after[rows]).max(1).sum())
+    return gained > np.log(GROSS)
 
 
 def unobservable(case: Case) -> Iterator[Finding]:

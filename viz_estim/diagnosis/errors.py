@@ -20,6 +20,33 @@ _FEWEST = 10
 _AT_FIRST = 0.05  # of the run: how late the first error may be known that is still told of as the start's; no rate
 
 
+def has_covariance(case: Case) -> bool:
+    """Whether a filter says how sure it is: by a covariance that is neither absent nor zero throughout."""
+    if case.run.labels or "cov" not in case.run.ends:
+        return True  # by probabilities
+    return bool((np.nan_to_num(case.run.cov) != 0).any())
+
+
+def untested(case: Case) -> Iterator[Finding]:
+    """Neither innovations nor errors that could be held against a covariance: silence would look like health."""
+    run = case.run
+    if run.labels or case.sensors or run.error or run.properties.get("belief") == "Particles" or is_registration(case):
+        return
+    if "mean" not in run.ends or np.isfinite(run.mean).all(1).sum() < _FEWEST:
+        return
+    truth, sure = np.isfinite(run.truth).any(), has_covariance(case)
+    if truth and sure:
+        return
+    tell = "tell `rec.stage` the residual and residual_cov of each update, with z, noise and gain"
+    yield Finding(
+        "untested", "note", None, case.whole, {"truth": bool(truth), "covariance": sure},
+        "no covariance is recorded, and no innovation: the errors against the truth are what they are, and what the "
+        "filter believes of them is not known" if truth else
+        "neither innovations nor a truth are recorded: nothing tells whether the estimate is right",
+        f"{tell}, and the covariance" if truth else f"{tell}; or tell `rec.step` the truth, where there is one",
+    )  # fmt: skip
+
+
 def start(case: Case) -> Iterator[Finding]:
     """The error of the first belief against its covariance: eᵀ·P⁻¹·e is χ² of as many components as have a truth.
 
@@ -40,10 +67,14 @@ def start(case: Case) -> Iterator[Finding]:
         mean, P = table.mean[-1], table.cov[-1]
     error = case.space.minus(run.truth[k], mean)
     known = np.isfinite(error) & (np.diag(P) > 0)
-    if not known.any() or np.linalg.cond(P[known][:, known]) > SOLVABLE:
+    if not known.any() or not np.isfinite(P).all() or np.linalg.cond(P[known][:, known]) > SOLVABLE:
         return
     value, dof = float(error[known] @ np.linalg.solve(P[known][:, known], error[known])), int(known.sum())
     severity = judge(float(chi2.sf(value, dof)), 1, large=bool(value > GROSS * dof))
+    last = case.run.at(int(run.step[k]))[-1][0] if table is None else None  # the stage that the belief is of
+    if severity and last is not None and "innovation.residual" in last.values:
+        # It was moved already, and a first reading of something bent may leave less than it can tell.
+        severity = "warning"
     if severity:
         sigma = np.where(known, np.abs(error) / np.sqrt(np.where(known, np.diag(P), 1.0)), 0.0)
         worst = int(np.argmax(sigma))
@@ -51,8 +82,10 @@ def start(case: Case) -> Iterator[Finding]:
         yield Finding(
             "start", severity, None, (step, step),
             {"component": name, "error": float(error[worst]), "sigma": float(sigma[worst]), "nees": value, "dof": dof},
-            f"the filter starts {sigma[worst]:.2g}σ off the truth, most of all in {name} ({error[worst]:+.3g} {unit})",
-            f"start it nearer, or with a standard deviation of {name} of about {abs(error[worst]):.2g} {unit}",
+            f"{'the filter starts' if last is None else f'after its first {last.name} the filter is'} "
+            f"{sigma[worst]:.2g}σ off the truth, most of all in {name} ({error[worst]:+.3g} {unit})",
+            f"start it nearer, or with a standard deviation of {name} of about {abs(error[worst]):.2g} {unit}"
+            + (", and record the first belief as a stage `start`, to see which of them is off" if last else ""),
         )  # fmt: skip
 
 
@@ -91,6 +124,8 @@ def by_part(case: Case) -> Iterator[Finding]:
         evidence = {"part": name, "mean_nees": mean, "dof": dof, "independent": independent, "p": p}
         code = "overconfident" if ratio > 1 else "underconfident"
         what = f"the error of {name} is {times(ratio**0.5)} as large as its covariance says"
+        if ratio * np.finfo(float).eps > 1:  # of a cloud of copies
+            what = f"the covariance of {name} is as good as zero beside its error"
         if ratio > 1:
             why, remedy = _too_sure(case, name)
             cause = f"{what}: {why}"
@@ -128,6 +163,6 @@ def _correlation_time(white: Array) -> float:
     rho = np.fft.irfft((np.abs(spectrum) ** 2).sum(1))[:T]
     rho = rho / max(rho[0], 1e-300)
     crossed = np.flatnonzero(rho <= 0)
-    end = int(crossed[0]) if len(crossed) else T
+    end = max(1, int(crossed[0])) if len(crossed) else T  # no error at all has no ρ₀ either
     tau = float(1 + 2 * (rho[1:end] ** 2).sum())
     return tau * (1 + float(norm.isf(level("warning", 1))) * (2 * (2 * end - 1) / T) ** 0.5)

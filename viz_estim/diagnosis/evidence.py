@@ -191,6 +191,23 @@ def tells_gain(table: StageTable) -> bool:
     return cross is not None and "gain" in table.values and bool(np.nan_to_num(cross).any())
 
 
+def sensor_of(table: StageTable) -> str | None:
+    """The sensor whose readings an update takes in; None where it takes in several."""
+    space = table.spaces["innovation"]
+    names = {name.partition("/")[0] for name in space.parts} if isinstance(space, Product) else set[str]()
+    return names.pop() if len(names) == 1 else None
+
+
+def tangents(space: Space, mean: Array, moved: Array) -> list[Array]:
+    """The matrices (M, d, d) by which filters carry a covariance on when the mean (M, n) is moved (M, d).
+
+    Not at all; by the half of it, as error-state filters reset (Solà 2017, eq. 287); or to the tangent space at the new
+    mean. They differ to the first order of the move, and none is wrong.
+    """
+    shares = (0.0,) if space.flat else (0.0, 0.5, 1.0)
+    return [np.asarray(space.transport(mean, share * moved), float) for share in shares]
+
+
 def tells_reading(predicted: Array) -> bool:
     """Whether readings are there, and not their residuals in their stead."""
     return bool(np.nan_to_num(predicted).any())

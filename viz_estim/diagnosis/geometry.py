@@ -10,10 +10,12 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, Euclidean, Product, Space, wrap
 from viz_estim.diagnosis.axes import explains, finding_of, maps
 from viz_estim.diagnosis.covariance import epsilon
-from viz_estim.diagnosis.evidence import Case, tells_reading
+from viz_estim.diagnosis.evidence import Case, Readings, tells_reading
 from viz_estim.diagnosis.finding import HALF_THE_DIGITS, Finding, level
 from viz_estim.diagnosis.kinematics import imu_axes, scale
 from viz_estim.recording.layout import leaves
+
+_TURNS = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0, "": None}  # by unit; unknown where none is told
 
 
 def wraps(case: Case) -> Iterator[Finding]:
@@ -21,10 +23,14 @@ def wraps(case: Case) -> Iterator[Finding]:
     sigma points on both sides of ±π (`_astride`). Neither can be by chance."""
     for name, readings in case.sensors.items():
         for i, unit in enumerate(readings.space.axis_units):
-            if unit != "rad" or isinstance(readings.space, SO3):
+            if unit not in _TURNS or isinstance(readings.space, SO3):
                 continue
             axis = readings.space.axes[i]
-            steps = set(readings.step[np.abs(readings.residual[:, i]) > np.pi].tolist()) | _astride(case, name, i)
+            turn = _TURNS[unit]
+            steps = _by_a_turn(readings, i) if turn is None else set(
+                readings.step[np.abs(readings.residual[:, i]) > turn / 2].tolist()
+            )  # fmt: skip
+            steps |= _astride(case, name, i) if unit == "rad" else set()
             if steps:
                 yield Finding(
                     "angle_wrap", "error", name, (min(steps), max(steps)), {"component": axis, "count": len(steps)},
@@ -33,6 +39,21 @@ def wraps(case: Case) -> Iterator[Finding]:
                     "wrap the residual to [−π, π), by SO2().minus, not z − h(x)",
                 )  # fmt: skip
                 break
+
+
+def _by_a_turn(readings: Readings, i: int) -> set[int]:
+    """The steps at which innovations of a component of unknown unit are a full turn, in radians or degrees, to within
+    what S allows, while reading and expectation are both angles of the first turn: a jump that no noise makes."""
+    if not isinstance(readings.space, Euclidean) or readings.z.shape != readings.residual.shape:
+        return set()
+    jump, sigma = np.abs(readings.residual[:, i]), np.sqrt(readings.cov[:, i, i])
+    for turn in (2 * np.pi, 360.0):
+        half = 0.5 * turn + 4 * sigma
+        angles = (np.abs(readings.z[:, i]) < half) & (np.abs(readings.predicted[:, i]) < half)
+        rows = (np.abs(jump - turn) < 4 * sigma) & (16 * sigma < turn) & angles
+        if rows.any() and (np.abs(readings.z[:, i]).max() < half.max()):
+            return set(readings.step[rows].tolist())
+    return set()
 
 
 def _astride(case: Case, sensor: str, i: int) -> set[int]:

@@ -145,16 +145,23 @@ def outliers(case: Case) -> Iterator[Finding]:
             gated = int((~readings.used[far]).sum())
             evidence: dict[str, Any] = {"outliers": count, "readings": N, "expected": N * TAIL, "p": p}
             evidence |= {"refused_by_gate": gated, "largest_nis": float(readings.nis.max())}
-            remedy = (
-                f"the gate refuses {gated} of them; look at the others by hand"
-                if gated
-                else f"set a gate ({gate_name(case, name)}=0.999) so that they move nothing; see where they come from"
-            )
+            cause = "detours, glitches or wrong associations, which a normal noise does not have"
+            if gated:
+                remedy = f"the gate refuses {gated} of them; look at the others by hand"
+            elif rows[0] == 0 and rows[-1] < 2 * count:  # most of the first ones, and none after
+                cause = "all among the first: the filter starts elsewhere than they say, and is too sure of it"
+                remedy = (
+                    "check the first belief and its covariance, and how the first update is made; set no gate on it"
+                )
+            else:
+                remedy = (
+                    f"set a gate ({gate_name(case, name)}=0.999) so that they move nothing; see where they come from"
+                )
             yield Finding(
                 "outliers", severity if gated < count else "note", name,
                 (int(readings.step[rows[0]]), int(readings.step[rows[-1]])), evidence,
-                f"{count} of {N} readings of {name} lie further off than one in a thousand should ({N * TAIL:.2g} "
-                "expected): detours, glitches or wrong associations, which a normal noise does not have",
+                f"{count} of {N} readings of {name} lie{'s' * (count == 1)} further off than one in a thousand should "
+                f"({N * TAIL:.2g} expected; the furthest by {readings.nis.max() ** 0.5:.3g}σ): {cause}",
                 remedy,
             )  # fmt: skip
 

@@ -10,6 +10,7 @@ look wrong; what a wrong one leaves is counted beyond that bound and beyond roun
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -112,28 +113,44 @@ def predicted(case: Case) -> Iterator[Finding]:
         unfelt = np.sqrt(2 / max(int(held.sum()), 1))
         drift = _follows(rest, moved)
         told = "control" in run.inputs  # else the prediction may follow what the recording does not hold
+        whole = told or run.properties.get("recorded_by") != "viz_estim.record"  # a loop need not tell what drives it
         largest = float(np.abs(table.mean).max())
         left, count = _left(change - moved, expected - moved, may, largest)
         size = np.median(np.linalg.norm(rest, axis=1))
         if size > HALF_THE_DIGITS * max(largest, 1.0) and ratio > unfelt and drift < _HALF:
             evidence = {"size_in_Q": ratio, "stage": table.name}
-            yield Finding(
-                "noisy_prediction", "error", None, steps, evidence,
-                f"the prediction moves the mean at random, by {ratio**0.5:.2g}× the standard deviation of Q: a sample "
-                "of the process noise is added to it",
-                "predict the mean by the model alone; the noise enters the covariance, as + Q",
-            )  # fmt: skip
+            cause = f"the prediction moves the mean at random, by {ratio**0.5:.2g}× the standard deviation of Q: "
+            remedy = "predict the mean by the model alone; the noise enters the covariance, as + Q"
+            if whole:
+                cause += "a sample of the process noise is added to it"
+                yield Finding("noisy_prediction", "error", None, steps, evidence, cause, remedy)
+            else:
+                cause += "a noisy control (an IMU, odometry) that the recording does not hold, or a sample of the noise"
+                remedy = f"tell of what moves it, `rec.step(control=…)`; if nothing does: {remedy}"
+                yield Finding("noisy_prediction", "note", None, steps, evidence, cause, remedy)
         elif (drift > _HALF or (told and ratio <= unfelt)) and (severity := _severity(left, count * change.shape[1])):
-            yield _wrong("F", severity, None, steps, left, "the process model f(x)")
+            finding = _wrong("F", severity, None, steps, left, "the process model f(x)")
+            if whole:
+                yield finding
+            else:
+                yield replace(
+                    finding, severity="warning",
+                    cause=f"{finding.cause}; or a control that follows the state moves it, which is not recorded",
+                    remedy=f"tell of what moves it, `rec.step(control=…)`; if nothing does: {finding.remedy}",
+                )  # fmt: skip
 
 
 def _alike(case: Case, row: np.ndarray) -> np.ndarray:
-    """Which neighbouring predictions, by their steps' rows (M,), have the same control and dt."""
+    """Which neighbouring predictions, by their steps' rows (M,), have the same control and dt.
+
+    What is read and no update takes in may be a control too.
+    """
     run = case.run
     alike = np.abs(np.diff(run.dt[row])) <= 1e-9 + 1e-6 * run.dt[row][1:]
-    control = run.inputs.get("control")
-    if control is not None:
-        alike &= (np.nan_to_num(control[row[1:]]) == np.nan_to_num(control[row[:-1]])).all(1)
+    for name, values in run.inputs.items():
+        sensor = name.removeprefix("z.").partition("/")[0]
+        if name == "control" or (name.startswith("z.") and sensor not in case.sensors):
+            alike &= (np.nan_to_num(values[row[1:]]) == np.nan_to_num(values[row[:-1]])).reshape(len(alike), -1).all(1)
     return alike
 
 

@@ -19,6 +19,7 @@ from viz_estim.diagnosis.finding import EXPLAINED, ODDS, SHEET, Finding, judge
 from viz_estim.diagnosis.fits import slope
 from viz_estim.diagnosis.naming import likeliest, named, of_motion
 
+_GRAVITY = 9.81  # m/s²
 _WORLD = "the world's axes"
 
 
@@ -110,6 +111,9 @@ def _elsewhere(case: Case) -> Iterator[Finding]:
         told_of: list[tuple[float, Finding]] = []
         for i, axis in enumerate("xyz"):
             told_of += _moves_as(f"{name} {axis}", "rad", of, truly[:, i] - told[:, i], told[:, i], one, none, 6)
+        if any(list(part.axis_units) == ["rad/s"] * 3 for part in case.space.parts.values()):
+            # A bias that is part of the state may have been taught by wrong readings, and drifts as it says.
+            told_of = [entry for entry in told_of if "drift" not in entry[1].evidence]
         yield from _best(told_of)
     if (moved := clouds.moves_of_means(case)) is not None:
         yield from _of_a_cloud(case, moved)
@@ -152,11 +156,20 @@ def _exchanged(truly: Array, told: Array, of: np.ndarray) -> Finding | None:
 
 
 def _best(told_of: list[tuple[float, Finding]]) -> Iterator[Finding]:
-    """One cause shows in several components: the one that it explains best is told."""
-    told_of = sorted(told_of, key=lambda entry: (entry[1].severity != "error", -entry[0]))
+    """One cause shows in several components: the one that it explains best is told, and of those that it explains as
+    well the highest derivative, which moves the others."""
+    told_of = sorted(
+        told_of,
+        key=lambda one: (one[1].severity != "error", -round(one[0], 2), -order(one[1].evidence.get("unit", ""))),
+    )
     if told_of:
         also = [f.evidence for _, f in told_of[1:]]
         yield replace(told_of[0][1], evidence=told_of[0][1].evidence | ({"also": also} if also else {}))
+
+
+def order(unit: str) -> int:
+    """Which derivative a unit is of, by its seconds: of m/s² the second."""
+    return 2 if unit.endswith("/s²") else 1 if unit.endswith("/s") else 0
 
 
 def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Array | None = None) -> Finding | None:
@@ -242,6 +255,10 @@ def _moves_as(
         if 0.5 * len(w) * np.log(left_factor / max(left_drift, 1e-300)) < np.log(ODDS):  # it was always told the same
             cause += f"; or it moves by {1 / (1 + beta):.3g}× what it does, which looks alike at one speed"
         remedy = f"calibrate that bias ({drift:+.3g} {rate}), or add it to the state and let the filter estimate it"
-        evidence = {"component": label, "drift": drift, "p": p_drift}
+        for times, what in ((1, "not added, or added twice"), (2, "added with the wrong sign")):
+            if rate == "m/s²" and abs(abs(drift) / (times * _GRAVITY) - 1) < SHEET:
+                cause += f"; as much as where gravity is {what}"
+                remedy = f"check the sign of gravity and that it is there once: a = R·f + (0, 0, −9.81); else {remedy}"
+        evidence = {"component": label, "drift": drift, "unit": rate, "p": p_drift}
     if severity:
         yield share, Finding("process_model", severity, None, steps, evidence | {"against": "truth"}, cause, remedy)

@@ -36,15 +36,19 @@ def ranked(found: list[Finding]) -> list[Finding]:
 
 
 def _as_large_as_their_errors(found: list[Finding]) -> list[Finding]:
-    """Information from nowhere is no matter of chance, and an error where only what follows from it is one."""
+    """What no chance is in is an error where only what follows from it is one: information from nowhere, and stages
+    that do not do what their own numbers say, which may each be off by little and add up."""
     errors = [f for f in found if f.severity == "error"]
     if not errors or any(f.code not in SYMPTOMS for f in errors):
         return found
     of = {f.sensor for f in errors}
-    claims = [
-        f.code == "unobservable_update" and f.severity == "warning" and bool({f.sensor, None} & of) for f in found
-    ]
-    return [replace(f, severity="error") if claim else f for f, claim in zip(found, claims, strict=True)]
+
+    def causes(f: Finding) -> bool:
+        exact = f.code in ("prediction", "update", "jacobian") or f.evidence.get("kind") == "claims"
+        shown = f.sensor in of or None in of or (exact and f.sensor is None)
+        return f.severity == "warning" and (exact or f.code == "unobservable_update") and shown
+
+    return [replace(f, severity="error") if causes(f) else f for f in found]
 
 
 def _of_the_noise(start: Finding, found: list[Finding]) -> Finding:

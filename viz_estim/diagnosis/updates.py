@@ -19,7 +19,8 @@ from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.covariance import epsilon, sound
-from viz_estim.diagnosis.evidence import Case, tells_gain, tells_reading
+from viz_estim.diagnosis.doubled import LINE, doubled
+from viz_estim.diagnosis.evidence import Case, sensor_of, tangents, tells_gain, tells_reading
 from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, Severity
 from viz_estim.recording.tables import StageTable
 
@@ -59,19 +60,16 @@ def updates(case: Case) -> Iterator[Finding]:
         if tells_gain(table) and (told := _told(case, table)) is not None:
             points = any(key.endswith(".points") for key in table.values)
             reading = tells_reading(table.values["innovation.predicted"])
+            twice = LINE if doubled(told.P, told.C, told.S, told.R, told.after, _left(told)) else None
             lines = [
-                _spread(told, points),
-                _gain(told),
-                _mean(told),
+                _spread(told, points), _gain(told), twice, _mean(told),
                 _added(told, _noise(case, told.step), list(case.space.axes_at.values())) or _cov(told),
-            ]
+            ]  # fmt: skip
             found = [_residual(told) if reading else None, *lines]
             for severity, what, cause, remedy in [one for one in found if one][:1]:
-                sensors = {name.partition("/")[0] for name in _space(table).parts}
-                name = sensors.pop() if len(sensors) == 1 else None
                 steps = int(told.step[0]), int(told.step[-1])
                 evidence = {"line": what, "stage": table.name, "updates": len(told.step)}
-                yield Finding("update", severity, name, steps, evidence, cause, remedy)
+                yield Finding("update", severity, sensor_of(table), steps, evidence, cause, remedy)
 
 
 def _space(table: StageTable) -> Product:
@@ -93,15 +91,18 @@ def _told(case: Case, table: StageTable) -> Told | None:
     rows[rows] &= sound(symmetrised(P[rows])) & sound(symmetrised(get["innovation.cov"][rows]))
     if rows.sum() < _FEWEST:
         return None
-    moved, after = case.space.minus(table.mean[rows], mean[rows]), table.cov[rows]
-    if not case.space.flat:  # back to the tangent space at the mean before
-        T = np.linalg.inv(case.space.transport(mean[rows], moved))
-        after = T @ after @ np.swapaxes(T, 1, 2)
+    moved = case.space.minus(table.mean[rows], mean[rows])
     difference = space.minus(get["innovation.z"][rows], get["innovation.predicted"][rows])
-    return Told(
+    told = Told(
         table.step[rows], P[rows], get["innovation.cross_cov"][rows], get["innovation.cov"][rows],
-        get["innovation.noise"][rows], get["gain"][rows], get["innovation.residual"][rows], difference, moved, after,
+        get["innovation.noise"][rows], get["gain"][rows], get["innovation.residual"][rows], difference, moved,
+        table.cov[rows],
     )  # fmt: skip
+    if case.space.flat:
+        return told
+    left, back = _left(told), [np.linalg.inv(A) for A in tangents(case.space, mean[rows], moved)]
+    kept = [told._replace(after=T @ told.after @ np.swapaxes(T, 1, 2)) for T in back]  # at the mean before
+    return min(kept, key=lambda one: float(np.median(np.linalg.norm(one.after - left, axis=(1, 2)))))
 
 
 def _residual(told: Told) -> _Line | None:
