@@ -94,3 +94,11 @@ def test_single_numbers_stand_one_below_the_other_and_are_named_in_words() -> No
     ]  # fmt: skip
     plain = layout(Product(x=Euclidean(["x"])), stages={"update": {"ess": one, "rmse": one}}, true_parts=[])
     assert [view.name for view in plots(plot_tabs.tabs(plain)[0])] == ["update: ess", "update: rmse"]
+
+
+@pytest.mark.parametrize("count", range(1, 7))
+def test_lanes_are_whole_in_a_small_window_and_leave_the_plots_half_of_it(count: int) -> None:
+    share = plot_tabs.lanes_share(count)
+    head, foot, title, ruler, lane = 37, 31, 27, 20, 40  # pixels, measured in a picture of 1280 x 720
+    assert share == 0.5 or share * (720 - head - foot) >= title + ruler + count * lane
+    assert share <= 0.5

@@ -23,7 +23,7 @@ def build(layout: Layout) -> rrb.Blueprint:
     shares: list[float] = {1: [1.0], 2: [2.6, 1.0], 3: [3.0, 2.0, 1.6]}[len(left)]
     if layout.camera:
         shares = [2.3, 2.4, 1.6]  # the unrolled sphere is twice as wide as high
-    low = min(0.4, 0.054 + 0.044 * (len(layout.inputs) + 1 + bool(layout.labels)))  # a lane is some 37 pixels high
+    low = plot_tabs.lanes_share(len(layout.inputs) + 1 + bool(layout.labels))
     whole = rrb.Horizontal(
         rrb.Vertical(*left, row_shares=shares),
         rrb.Vertical(plots, lanes, row_shares=[1 - low, low]),

@@ -41,8 +41,7 @@ def build(alone: Alone, scenes: Scenes, findings: int, markdown: str) -> rrb.Blu
         lanes,
     ]
     sensors = {name.partition(".")[2] for name in alone.run.inputs if "." in name}
-    count = findings + len(sensors) + 1 + bool(alone.run.labels)  # a lane is some 40 pixels high
-    low = min(0.5, 0.05 + 0.043 * count)
+    low = plot_tabs.lanes_share(findings + len(sensors) + 1 + bool(alone.run.labels))
     parts = [2.0] * bool(spatial) + [3.0] * bool(tabs)  # the evidence is more to read than the scene
     rest = [(1 - low) * part / sum(parts) for part in parts]
     return rrb.Blueprint(

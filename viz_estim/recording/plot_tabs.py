@@ -19,6 +19,8 @@ _Item = rrb.Container | rrb.View
 _MANY = 5  # rows of plots that one tab holds
 _READABLE = 4  # rows of a tab at most where they can as well be in two
 _MINUTE = 60.0  # s
+_SMALL = 652  # pixels that views have above one another in a window 720 high
+_LANE, _LANES_HEAD = 40, 48  # pixels of a lane with its name, and of what stands above all
 # What the single numbers of our own stages mean, those first that say most.
 _OF_CLOUDS = {
     "evidence": "log-evidence of the reading",
@@ -40,6 +42,11 @@ def figure_names(fields: list[str], *, fit: bool, particles: int | None) -> dict
 def lanes(origin: str, name: str) -> rrb.StateTimelineView:
     """Lanes, of the whole run."""
     return rrb.StateTimelineView(origin=origin, name=name, time_view=_whole_run())
+
+
+def lanes_share(count: int) -> float:
+    """The share of the height at which so many lanes are whole in a small window, up to half of it."""
+    return min(0.5, (_LANES_HEAD + _LANE * count) / _SMALL)
 
 
 def show_all(item: _Item, duration: float) -> _Item:
