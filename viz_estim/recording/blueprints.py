@@ -20,9 +20,9 @@ def build(layout: Layout) -> rrb.Blueprint:
     lanes = plot_tabs.lanes(schema.LANES, "Lanes: stage, and what became of each sensor's reading")
     notes = rrb.TextDocumentView(origin=schema.NOTES, name="What to look at")
     left: list[_Item] = [*scenes, notes]
-    shares: list[float] = {1: [1.0], 2: [2.6, 1.0], 3: [3.0, 2.0, 1.6]}[len(left)]
+    shares: list[float] = {1: [1.0], 2: [2.1, 1.0], 3: [3.0, 1.9, 2.0]}[len(left)]
     if layout.camera:
-        shares = [2.3, 2.4, 1.6]  # the unrolled sphere is twice as wide as high
+        shares = [2.0, 2.2, 2.1]  # the unrolled sphere is twice as wide as high
     low = plot_tabs.lanes_share(len(layout.inputs) + 1 + bool(layout.labels))
     whole = rrb.Horizontal(
         rrb.Vertical(*left, row_shares=shares),
@@ -87,7 +87,7 @@ def _scenes(layout: Layout) -> list[_Item]:
         if own_scene(layout, name):
             colour, _ = schema.sensor_colour(layout.place(name))
             title = f"{name}{unit_of(space, 0, space.units)}: measured {colour}, predicted amber"
-            second.append(_scene(schema.sensor(name), title, layout.reach[name]))
+            second.append(_scene(schema.sensor(name), title, 0.87 * layout.reach[name]))  # it has no axes outside
     if second:
         first.append(rrb.Tabs(*second, active_tab=0) if len(second) > 1 else second[0])
     return first

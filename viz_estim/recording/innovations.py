@@ -64,7 +64,8 @@ class Innovations:
         titles = [f"by {name} {axis}" if axis not in ("", name) else f"by {name}" for name, axis in names]
         for i, axis in enumerate(self._layout.space.axes):
             series = list(zip(titles, colours, moved[:, i, :].T, strict=True))
-            self._lines.draw(f"{schema.plot('moved', axis)}/{schema.as_part(rows.name)}", at, "σ", series)
+            plot = schema.plot("moved", axis)
+            self._lines.draw(f"{plot}/{schema.as_part(rows.name)}", at, "σ", series, plot=plot)
 
     def _colour(self, sensor: str) -> schema.Colour:
         return schema.sensor_colour(self._layout.place(sensor))[1]

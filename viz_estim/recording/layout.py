@@ -21,6 +21,7 @@ from viz_estim.core.scenery import Camera, Cloud, Landmarks, Path
 from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product, Space
 from viz_estim.core.stages import Innovation, Matches, SigmaPoints
 from viz_estim.recording.batch import Batch, StageRows, kinds_of
+from viz_estim.recording.ranges import Ranges
 
 KEPT = 4000  # particles of a cloud at most: more are thinned by weight
 
@@ -33,7 +34,7 @@ class Layout:
     innovations came from; reach: about how long their readings are; silent: by sensor the steps at which a reading was
     due and none came; true_parts: the parts of the state that have a truth; gapless: those of them that have it at
     every step; particles: how many the belief has; matched: clouds are matched, a registration. position, heading,
-    attitude: the parts that say where and how the body is, if any.
+    attitude: the parts that say where and how the body is, if any. ranges: of the plots' axes.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -60,6 +61,7 @@ class Layout:
         self.inputs: list[str] = []
         self.sensors: dict[str, Space] = {}
         self.reach: dict[str, float] = {}
+        self.ranges = Ranges()
 
     @property
     def planar(self) -> bool:

@@ -9,7 +9,7 @@ from viz_estim.core.descriptions import describe
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Step, Tick
 from viz_estim.core.spaces import SO3, Euclidean, Space
-from viz_estim.recording import schema
+from viz_estim.recording import blueprints, schema
 from viz_estim.recording.batch import Batch
 from viz_estim.recording.columns import Times, drawn, send, send_static, words
 from viz_estim.recording.innovations import Innovations
@@ -22,7 +22,7 @@ class Plots:
 
     def __init__(self, stream: rr.RecordingStream, layout: Layout) -> None:
         self._stream, self._layout = stream, layout
-        self._lines = Lines(stream)
+        self._lines = Lines(stream, layout.ranges)
         self._innovations = Innovations(self._lines, layout)
         self._styled: set[str] = set()
         self._states: dict[str, str] = {}  # by lane: what it shows last
@@ -38,6 +38,8 @@ class Plots:
         gated = self._innovations.add(batch)
         for sensor in self._layout.inputs:
             self._draw_health(batch, sensor, gated.get(sensor, set()))
+        if self._layout.ranges.outgrown():
+            self._stream.send_blueprint(blueprints.build(self._layout))
 
     def _draw_states(self, batch: Batch) -> None:
         """The belief at the end of each step, by part: its components, its σ, its error."""
@@ -76,14 +78,14 @@ class Plots:
             series: list[Series] = []
             if reading is not None:
                 read = (reading[0], self._colour(reading[0]), scale * reading[1][:, i])
-                self._lines.broken(f"{path}/reading", at, unit, read)
+                self._lines.broken(f"{path}/reading", at, unit, read, path)
             true_line = ("truth", schema.TRUTH, scale * true[:, i])
             if name in self._layout.gapless:
                 series.append(true_line)
             series.append(("estimate", schema.ESTIMATE, scale * x[:, i]))
             self._lines.draw(path, at, unit, series, scale**2 * var[:, i] if own_sigma else None)
             if name in self._layout.true_parts and name not in self._layout.gapless:
-                self._lines.broken(f"{path}/truth", at, unit, true_line)
+                self._lines.broken(f"{path}/truth", at, unit, true_line, path)
 
     def _direct_reading(self, part: Space, steps: list[Step]) -> tuple[str, Array] | None:
         """The sensor that reads this part of the state as it is (a gyro reads the rate), and its readings."""

@@ -1,0 +1,95 @@
+"""What part of its values a plot's axis shows: most of them, and at least two numbers to read them by.
+
+A plot left to itself shows all. Then a filter's first σ, or one outlier, flattens everything after it; and the viewer
+names powers of ten alone where a plot is low, so that an axis from −5 to 5 says 0 and nothing else.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun.blueprint as rrb
+
+from viz_estim.core.quaternions import Array
+
+_ASIDE = 0.02  # of the values at either end may be out of sight
+_CALM = 2.5  # all is shown where it is no more than this, by what most need
+_ROOM = 0.25  # of what most need, above and below it
+_KEPT = 2048  # rows of a plot, at most; more are thinned evenly
+_MORE = 1.02  # looked at again when so many more rows have come
+_NUMBERS = 7.0  # steps of a power of ten that are still named on a low plot
+_EDGE = 0.03  # of the axis, beyond the last value
+
+
+class Ranges:
+    """Learns the values of plots by their paths, in bounded memory, and says which axis shows them."""
+
+    def __init__(self) -> None:
+        self._seen: dict[str, _Seen] = {}
+        self._shown: dict[str, tuple[float, float, float]] = {}
+        self._rows = self._looked = 0
+
+    def learn(self, path: str, values: Array) -> None:
+        """Takes in lines (N, k) of a plot; what is not finite is none."""
+        known = values[np.isfinite(values).all(1)]
+        if len(known):
+            self._rows += len(known)
+            self._seen.setdefault(path, _Seen()).add(known.min(1), known.max(1))
+
+    def axis(self, path: str, calm: float = _CALM) -> rrb.ScalarAxis | None:
+        """The axis of a plot; none where nothing is known, or all is one value. calm: all is shown where it is no more
+        than so many times what most need."""
+        found = self._seen[path].range(calm) if path in self._seen else None
+        if found is None:
+            return None
+        self._shown[path] = (*found, calm)
+        return rrb.ScalarAxis(range=found)
+
+    def outgrown(self) -> bool:
+        """Whether an axis that was asked for is to be another by now."""
+        if not self._shown or self._rows < _MORE * self._looked:
+            return False
+        self._looked = self._rows
+        for path, (low, high, calm) in self._shown.items():
+            span = high - low
+            now = self._seen[path].range(calm)
+            if now and (max(low - now[0], now[1] - high) > 0.08 * span or now[1] - now[0] < 0.6 * span):
+                return True
+        return False
+
+
+class _Seen:
+    """The rows of a plot: the lowest and the highest value of each, thinned, and of all."""
+
+    def __init__(self) -> None:
+        self._low, self._high = np.empty(0), np.empty(0)
+        self._all = (np.inf, -np.inf)
+        self._stride, self._count = 1, 0
+
+    def add(self, low: Array, high: Array) -> None:
+        self._all = min(self._all[0], float(low.min())), max(self._all[1], float(high.max()))
+        chosen = slice(-self._count % self._stride, None, self._stride)
+        self._count += len(low)
+        self._low, self._high = np.append(self._low, low[chosen]), np.append(self._high, high[chosen])
+        while len(self._low) > _KEPT:
+            self._low, self._high, self._stride = self._low[::2], self._high[::2], 2 * self._stride
+
+    def range(self, calm: float) -> tuple[float, float] | None:
+        least, most = self._all
+        low, high = float(np.quantile(self._low, _ASIDE)), float(np.quantile(self._high, 1 - _ASIDE))
+        core = high - low
+        if most - least > calm * core > 0:
+            least, most = max(least, low - _ROOM * core), min(most, high + _ROOM * core)
+        return readable(least, most) if most - least > 1e-9 * max(abs(least), abs(most)) else None
+
+
+def readable(low: float, high: float) -> tuple[float, float]:
+    """The same range, made longer where fewer than two multiples of a power of ten would be named on it."""
+    step = 10.0 ** np.ceil(np.log10((high - low) / _NUMBERS))
+    above, below = (np.floor(high / step) + 1) * step, (np.ceil(low / step) - 1) * step
+    while (above - below) / step < 2.5:  # they are the next ones outside
+        if above - high <= low - below:
+            high, above = above, above + step
+        else:
+            low, below = below, below - step
+    edge = _EDGE * (high - low)
+    return float(low - edge), float(high + edge)
