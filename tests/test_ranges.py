@@ -68,4 +68,4 @@ def test_an_axis_is_made_anew_once_values_outgrow_it_and_memory_is_bounded() -> 
     assert ranges.outgrown()
     ranges.axis("plot")
     assert not ranges.outgrown()
-    assert len(ranges._seen["plot"]._low) <= 2048
+    assert len(ranges._seen["plot"]._low) <= 1024

@@ -28,7 +28,7 @@ KEPT = 4000  # particles of a cloud at most: more are thinned by weight
 
 class Layout:
     """space: the state's, as a product (of nothing, where the belief is over labels); inputs: the sensors on ticks;
-    duration: in s, as far as it is known beforehand.
+    duration: in s, as far as it is known so far; last: the last step, 0 where it is not known beforehand.
 
     stages: per stage the shape (as JSON: a list) or the space of each field; sensors: the spaces of those that
     innovations came from; reach: about how long their readings are; silent: by sensor the steps at which a reading was
@@ -45,6 +45,7 @@ class Layout:
         self.true_parts = [name for name, rows in known.items() if rows.any()]
         self.gapless = {name for name in self.true_parts if known[name].all()}
         self.duration = scenario.ticks[-1].time - scenario.ticks[0].time
+        self.last = len(scenario.ticks) - 1
         parts = self.space.parts.items()
         self.position = next((name for name, part in parts if is_position(part) or isinstance(part, SE2)), None)
         self.heading = next((name for name, part in parts if isinstance(part, (SO2, SE2))), None)
@@ -108,6 +109,7 @@ class Layout:
     def learn(self, batch: Batch) -> bool:
         """Takes in what is new; True where anything is."""
         self._widen(batch)
+        self.duration = max(self.duration, float(batch.times.time[-1]))
         new = False
         for rows in batch.stages:
             if self._unknown.get(rows.name, True):

@@ -38,7 +38,12 @@ class Plots:
         gated = self._innovations.add(batch)
         for sensor in self._layout.inputs:
             self._draw_health(batch, sensor, gated.get(sensor, set()))
-        if self._layout.ranges.outgrown():
+        self._frame(batch)
+
+    def _frame(self, batch: Batch) -> None:
+        """Sends the view anew where axes are to be others by now: at the end for certain, before it now and then."""
+        ended = batch.times.step[-1] == self._layout.last or batch.steps[-1].error
+        if self._layout.ranges.outgrown(1.0 if ended else 1.8 if self._layout.last else 1.1):
             self._stream.send_blueprint(blueprints.build(self._layout))
 
     def _draw_states(self, batch: Batch) -> None:

@@ -14,8 +14,7 @@ from viz_estim.core.quaternions import Array
 _ASIDE = 0.02  # of the values at either end may be out of sight
 _CALM = 2.5  # all is shown where it is no more than this, by what most need
 _ROOM = 0.25  # of what most need, above and below it
-_KEPT = 2048  # rows of a plot, at most; more are thinned evenly
-_MORE = 1.02  # looked at again when so many more rows have come
+_KEPT = 1024  # rows of a plot, at most; more are thinned evenly
 _NUMBERS = 7.0  # steps of a power of ten that are still named on a low plot
 _EDGE = 0.03  # of the axis, beyond the last value
 
@@ -30,10 +29,14 @@ class Ranges:
 
     def learn(self, path: str, values: Array) -> None:
         """Takes in lines (N, k) of a plot; what is not finite is none."""
-        known = values[np.isfinite(values).all(1)]
-        if len(known):
-            self._rows += len(known)
-            self._seen.setdefault(path, _Seen()).add(known.min(1), known.max(1))
+        least, most = (float(values.min()), float(values.max())) if len(values) else (np.nan, np.nan)
+        if not np.isfinite(least + most):
+            values = values[np.isfinite(values).all(1)]
+            if not len(values):
+                return
+            least, most = float(values.min()), float(values.max())
+        self._rows += len(values)
+        self._seen.setdefault(path, _Seen()).add(values, least, most)
 
     def axis(self, path: str, calm: float = _CALM) -> rrb.ScalarAxis | None:
         """The axis of a plot; none where nothing is known, or all is one value. calm: all is shown where it is no more
@@ -44,9 +47,10 @@ class Ranges:
         self._shown[path] = (*found, calm)
         return rrb.ScalarAxis(range=found)
 
-    def outgrown(self) -> bool:
-        """Whether an axis that was asked for is to be another by now."""
-        if not self._shown or self._rows < _MORE * self._looked:
+    def outgrown(self, more: float = 1.0) -> bool:
+        """Whether an axis that was asked for is to be another by now. more: looks again when there are so many times
+        the rows that there were the last time, for it takes a while."""
+        if not self._shown or self._rows < more * self._looked:
             return False
         self._looked = self._rows
         for path, (low, high, calm) in self._shown.items():
@@ -65,17 +69,18 @@ class _Seen:
         self._all = (np.inf, -np.inf)
         self._stride, self._count = 1, 0
 
-    def add(self, low: Array, high: Array) -> None:
-        self._all = min(self._all[0], float(low.min())), max(self._all[1], float(high.max()))
-        chosen = slice(-self._count % self._stride, None, self._stride)
-        self._count += len(low)
-        self._low, self._high = np.append(self._low, low[chosen]), np.append(self._high, high[chosen])
+    def add(self, values: Array, least: float, most: float) -> None:
+        self._all = min(self._all[0], least), max(self._all[1], most)
+        chosen = values[-self._count % self._stride :: self._stride]
+        self._count += len(values)
+        self._low, self._high = np.append(self._low, chosen.min(1)), np.append(self._high, chosen.max(1))
         while len(self._low) > _KEPT:
             self._low, self._high, self._stride = self._low[::2], self._high[::2], 2 * self._stride
 
     def range(self, calm: float) -> tuple[float, float] | None:
         least, most = self._all
-        low, high = float(np.quantile(self._low, _ASIDE)), float(np.quantile(self._high, 1 - _ASIDE))
+        aside = int(_ASIDE * len(self._low))
+        low, high = float(np.sort(self._low)[aside]), float(np.sort(self._high)[-1 - aside])
         core = high - low
         if most - least > calm * core > 0:
             least, most = max(least, low - _ROOM * core), min(most, high + _ROOM * core)
