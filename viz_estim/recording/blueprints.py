@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
-from viz_estim.recording import pictures, plot_tabs, schema
+from viz_estim.recording import eyes, pictures, plot_tabs, schema
 from viz_estim.recording.layout import Layout
 from viz_estim.recording.plot_tabs import unit_of
 from viz_estim.recording.scenes import own_scene
@@ -62,14 +62,10 @@ def _scenes(layout: Layout) -> list[_Item]:
     truth = ", truth white" if layout.true_parts else ""
     first: list[_Item] = []
     if layout.labels:
-        middle = 0.5 * schema.BAR * (len(layout.labels) - 1)
-        eye = rrb.EyeControls3D(
-            position=[middle, 0.45, 1.3 + 0.35 * len(layout.labels)], look_target=[middle, 0.45, 0],
-            eye_up=[0, 1, 0], kind="Orbital",
-        )  # fmt: skip
         name = "Belief: the probability of each label at this moment"
         first.append(rrb.Spatial3DView(
-            origin=schema.BARS, name=name, eye_controls=eye, line_grid=False, background=_BACKGROUND
+            origin=schema.BARS, name=name, eye_controls=eyes.bars(len(layout.labels)), line_grid=False,
+            background=_BACKGROUND,
         ))  # fmt: skip
     if layout.position:
         kind = "Plan from above" if layout.planar else "World"
@@ -96,12 +92,8 @@ def _scenes(layout: Layout) -> list[_Item]:
 def _world(layout: Layout, name: str) -> rrb.Spatial3DView:
     """The world, whole at first; a plan is seen from above. Trails reach back to the start."""
     assert layout.extent
-    (x, y, z), reach = layout.extent
-    if layout.planar:
-        eye = rrb.EyeControls3D(position=[x, y, 2.5 * reach], look_target=[x, y, 0], eye_up=[0, 1, 0], kind="Orbital")
-    else:
-        place = [x + 1.5 * reach, y - 1.85 * reach, z + 1.25 * reach]
-        eye = rrb.EyeControls3D(position=place, look_target=[x, y, z], eye_up=[0, 0, 1], kind="Orbital")
+    centre, reach = layout.extent
+    eye = eyes.above(centre, 2.5 * reach) if layout.planar else eyes.aside(centre, layout.half_sizes)
     start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     since = [rrb.VisibleTimeRange(timeline, start=start, end=now) for timeline in ("step", "time", "stage")]
     return rrb.Spatial3DView(
@@ -115,10 +107,9 @@ def _world(layout: Layout, name: str) -> rrb.Spatial3DView:
 
 
 def _scene(origin: str, name: str, size: float) -> rrb.Spatial3DView:
-    eye = rrb.EyeControls3D(
-        position=[1.6 * size, -1.9 * size, 1.1 * size], look_target=[0, 0, 0], eye_up=[0, 0, 1], kind="Orbital"
+    return rrb.Spatial3DView(
+        origin=origin, name=name, eye_controls=eyes.around(size), line_grid=False, background=_BACKGROUND
     )
-    return rrb.Spatial3DView(origin=origin, name=name, eye_controls=eye, line_grid=False, background=_BACKGROUND)
 
 
 def _round(length: float) -> float:

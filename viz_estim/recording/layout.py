@@ -77,6 +77,12 @@ class Layout:
         low, high = self._box
         return 0.5 * (low + high), max(0.5, float(0.5 * np.abs(high - low).max()))
 
+    @property
+    def half_sizes(self) -> Array:
+        """The half sizes (3,) in m of the box about what is known so far to be in the scene."""
+        assert self._box is not None
+        return 0.5 * (self._box[1] - self._box[0])
+
     def _known_places(self, scenario: Scenario, truth: Array) -> Array:
         """The box (2, 3) about the places that are known beforehand."""
         assert self.position

@@ -136,7 +136,7 @@ def _figures(layout: Layout) -> list[_Item]:
         for field, words in named.items():
             top = _TOPS.get(field) if layout.matched else layout.particles if field in _COUNTED else None
             axis = rrb.ScalarAxis(range=(-0.03 * top, 1.03 * top)) if top else None
-            views.append(graph("figure", f"{stage}.{field}", f"{stage}: {words}", axis))
+            views.append(_framed(layout, "figure", f"{stage}.{field}", f"{stage}: {words}", axis))
     across = -(-len(views) // _READABLE)
     rows = [rrb.Horizontal(*views[i : i + across]) for i in range(0, len(views), max(across, 1))]
     return [rrb.Vertical(*rows, name="Figures")] if rows else []
@@ -223,9 +223,12 @@ def _sigmas(layout: Layout) -> list[_Item]:
     return views
 
 
-def _framed(layout: Layout, group: str, component: str, name: str, *, legend: bool = False) -> rrb.TimeSeriesView:
-    """A plot whose axis shows most of its values; what moved the state does so by jumps, which are to be seen."""
-    axis = layout.ranges.axis(schema.plot(group, component), *[10.0] * (group == "moved"))
+def _framed(
+    layout: Layout, group: str, component: str, name: str, axis: rrb.ScalarAxis | None = None, *, legend: bool = False
+) -> rrb.TimeSeriesView:
+    """A plot whose axis, unless it is given, shows most of its values; of some the jumps are what they have to say."""
+    jumps = [10.0] * (group in ("moved", "figure"))
+    axis = axis or layout.ranges.axis(schema.plot(group, component), *jumps)
     return graph(group, component, name, axis, legend=legend)
 
 

@@ -10,7 +10,7 @@ from rerun.chunk import Chunk
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, Space
-from viz_estim.recording import schema
+from viz_estim.recording import eyes, schema
 from viz_estim.recording.compared import Compared
 from viz_estim.recording.layout import flat3, is_position, place_of
 from viz_estim.recording.pictures import CANVAS, PANORAMA
@@ -109,26 +109,17 @@ def _since_start() -> list[rrb.VisibleTimeRange]:
 def _eye(scene: str, holders: list[Compared], first: Compared, scenes: Scenes, wide: float) -> rrb.EyeControls3D:
     """The same for all runs: the first's places decide; round a sphere as far away as it is large."""
     if scene == schema.BARS:
-        count = max(len(one.run.labels) for one in holders)
-        middle = 0.5 * schema.BAR * (count - 1)
-        return rrb.EyeControls3D(
-            position=[middle, 0.45, 1.3 + 0.35 * count], look_target=[middle, 0.45, 0], eye_up=[0, 1, 0], kind="Orbital"
-        )
+        return eyes.bars(max(len(one.run.labels) for one in holders))
     if scene != schema.WORLD:
-        size = scenes.sizes.get((scene, holders[0].place), 1.0)
-        place = [1.6 * size, -1.9 * size, 1.1 * size]
-        return rrb.EyeControls3D(position=place, look_target=[0, 0, 0], eye_up=[0, 0, 1], kind="Orbital")
+        return eyes.around(scenes.sizes.get((scene, holders[0].place), 1.0))
     places = _places(first) if _position(first) else _places(holders[0])
     points = np.concatenate([places, *scenes.standing])
     points = points[np.isfinite(points).all(1)]
     low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.ones(3))
-    (x, y, z), reach = 0.5 * (low + high), max(0.5, float(0.5 * np.abs(high - low).max()))
     if low[2] == high[2]:
         # The eye sees about as much upwards as it is away, and `wide` times that across; a fifth is left as a margin.
-        height = 1.25 * max(1.0, (high - low)[1], (high - low)[0] / wide)
-        return rrb.EyeControls3D(position=[x, y, height], look_target=[x, y, 0], eye_up=[0, 1, 0], kind="Orbital")
-    place = [x + 1.5 * reach, y - 1.85 * reach, z + 1.25 * reach]
-    return rrb.EyeControls3D(position=place, look_target=[x, y, z], eye_up=[0, 0, 1], kind="Orbital")
+        return eyes.above(0.5 * (low + high), 1.25 * max(1.0, (high - low)[1], (high - low)[0] / wide))
+    return eyes.aside(0.5 * (low + high), 0.5 * (high - low))
 
 
 def _position(one: Compared) -> tuple[str, Space] | None:
