@@ -7,7 +7,7 @@ import rerun as rr
 
 from viz_estim.core.descriptions import describe
 from viz_estim.core.quaternions import Array
-from viz_estim.core.run import Step, Tick
+from viz_estim.core.run import Tick
 from viz_estim.core.spaces import SO3, Euclidean, Space
 from viz_estim.recording import blueprints, schema
 from viz_estim.recording.batch import Batch
@@ -15,6 +15,7 @@ from viz_estim.recording.columns import Times, drawn, send, send_static, words
 from viz_estim.recording.innovations import Innovations
 from viz_estim.recording.layout import Layout
 from viz_estim.recording.lines import Lines, Series, shown, sigma_plots
+from viz_estim.recording.readings import told
 
 
 class Plots:
@@ -55,7 +56,7 @@ class Plots:
         space = self._layout.space
         for name, part in space.parts.items():
             x, true, var = mean[:, space.at[name]], truth[:, space.at[name]], variance[:, space.axes_at[name]]
-            self._plot_state(name, part, at, x, true, var, [batch.steps[i] for i in row.tolist()])
+            self._plot_state(name, part, at, x, true, var, self._direct_reading(batch, name, part))
             sigma, colours = np.sqrt(np.maximum(var, 0)), schema.line_colours(len(part.axes))
             for plot, axes in sigma_plots(name, part).items():
                 unit, scale = shown(part.axis_units[axes[0]])
@@ -69,11 +70,10 @@ class Plots:
                     self._lines.within(path, at, part.axis_units[i], line, var[:, i], gapless=gapless)
 
     def _plot_state(
-        self, name: str, part: Space, at: Times, x: Array, true: Array, var: Array, steps: list[Step]
+        self, name: str, part: Space, at: Times, x: Array, true: Array, var: Array, reading: tuple[str, Array] | None
     ) -> None:
         """Each component: the estimate with ±1σ where it has one of its own, the truth, and who reads it directly."""
         own_sigma = len(part.names) == len(part.axes)
-        reading = self._direct_reading(part, steps)
         if isinstance(part, SO3):
             # q and −q are one rotation: the truth is shown on the estimate's side.
             true = true * np.copysign(1.0, np.nansum(true * x, axis=1, keepdims=True))
@@ -92,12 +92,20 @@ class Plots:
             if name in self._layout.true_parts and name not in self._layout.gapless:
                 self._lines.broken(f"{path}/truth", at, unit, true_line, path)
 
-    def _direct_reading(self, part: Space, steps: list[Step]) -> tuple[str, Array] | None:
-        """The sensor that reads this part of the state as it is (a gyro reads the rate), and its readings."""
-        for name, space in self._layout.sensors.items():
+    def _direct_reading(self, batch: Batch, name: str, part: Space) -> tuple[str, Array] | None:
+        """The sensor that reads this part of the state as it is (a gyro reads the rate), and its readings by step."""
+        for sensor, space in self._layout.sensors.items():
             if isinstance(part, Euclidean) and any(part.units) and describe(space) == describe(part):
                 nothing = np.full(len(part.names), np.nan)
-                return name, np.array([step.tick.measurements.get(name, nothing) for step in steps])
+                read = np.array(
+                    [batch.steps[i].tick.measurements.get(sensor, nothing) for i in batch.end_rows.tolist()]
+                )
+                for rows in batch.stages:
+                    for field, what in self._layout.stages[rows.name].items():
+                        if "innovation" in what and sensor in getattr(rows.stages[0], field).space.parts:
+                            untold = rows.at.step[~told(self._layout, rows, field, sensor, name)]
+                            read[np.isin(batch.times.step[batch.end_rows], untold)] = np.nan
+                return sensor, read
         return None
 
     def _draw_figures(self, batch: Batch) -> None:
