@@ -7,7 +7,7 @@ import pytest
 import rerun.blueprint as rrb
 
 from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product
-from viz_estim.recording import plot_tabs
+from viz_estim.recording import blueprints, plot_tabs
 from viz_estim.recording.ranges import Ranges
 
 XYZ = ("x", "y", "z")
@@ -117,3 +117,12 @@ def test_lanes_are_whole_in_a_small_window_and_leave_the_plots_half_of_it(count:
     head, foot, title, ruler, lane = 37, 31, 27, 20, 40  # pixels, measured in a picture of 1280 x 720
     assert share == 0.5 or share * (720 - head - foot) >= title + ruler + count * lane
     assert share <= 0.5
+
+
+def test_a_run_that_says_not_what_to_look_at_is_explained_in_a_few_lines() -> None:
+    pose = layout(Product(pose=SE2()), explained=False, attitude=None)
+    text = blueprints.legend(pose)
+    assert "NIS" in text
+    assert len(text) < 600
+    assert "NIS" not in blueprints.legend(layout(Product(pose=SE2()), explained=True, attitude=None))
+    assert "NIS" not in blueprints.legend(layout(Product(pose=SE2()), explained=False, attitude=None, particles=9))

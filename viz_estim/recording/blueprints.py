@@ -53,7 +53,24 @@ def legend(layout: Layout) -> str:
             said += ", each sensor has its own; red, green and blue are the axes x, y, z"
         elif not layout.particles:
             said += ", each sensor has its own"
-    return f"**Colours:** {said}. On the `stage` timeline each stage shows what it alone drew."
+    colours = f"**Colours:** {said}. On the `stage` timeline each stage shows what it alone drew."
+    return colours if layout.explained or layout.labels or layout.matched else f"{_guide(layout)}\n\n{colours}"
+
+
+def _guide(layout: Layout) -> str:
+    """How the first tab is read, where nobody says what to look at."""
+    said = ["An **error** outside its grey ±3σ: the filter is surer than it has reason to be."] * bool(
+        layout.true_parts
+    )
+    if layout.particles:
+        said.append("A cloud of few distinct particles is as good as lost.")
+    else:
+        said += [
+            "**NIS** mostly above its upper line says the same, mostly near 0 that it trusts its readings too little.",
+            "An innovation off zero on one side: something systematic is left out.",
+            "*What moved it* says which reading pulled the estimate.",
+        ]
+    return " ".join(said)
 
 
 def _scenes(layout: Layout) -> list[_Item]:
@@ -68,13 +85,14 @@ def _scenes(layout: Layout) -> list[_Item]:
             background=_BACKGROUND,
         ))  # fmt: skip
     if layout.position:
-        kind = "Plan from above" if layout.planar else "World"
+        assert layout.extent
+        kind = f"{'Plan' if layout.planar else 'World'}, grid {eyes.spacing(layout.extent[1]):g} m"
         title = f"estimate amber with 3σ{truth}, before the update grey"
         if layout.particles:
             title = f"particles blue (light) to amber (heavy), modes yellow{truth}"
         elif layout.matched:
             title = "moved cloud amber, fixed grey, pairs blue (near) to red (far)"
-        first.append(_world(layout, f"{kind} [m]: {title}"))
+        first.append(_world(layout, f"{kind}: {title}"))
     second: list[_Item] = [*pictures.views(layout)]
     if layout.attitude and not layout.matched:
         title = f"Attitude: estimate amber{truth}{', sigma points on the sphere' if points else ''}"
@@ -100,7 +118,7 @@ def _world(layout: Layout, name: str) -> rrb.Spatial3DView:
         origin=schema.WORLD,
         name=name,
         eye_controls=eye,
-        line_grid=rrb.LineGrid3D(visible=True, spacing=_round(reach / 4), color=(45, 46, 50)),
+        line_grid=eyes.ground(reach),
         background=_BACKGROUND,
         overrides={f"{schema.WORLD}/{of}/trail": [rrb.VisibleTimeRanges(since)] for of in ("estimate", "truth")},
     )
@@ -110,9 +128,3 @@ def _scene(origin: str, name: str, size: float) -> rrb.Spatial3DView:
     return rrb.Spatial3DView(
         origin=origin, name=name, eye_controls=eyes.around(size), line_grid=False, background=_BACKGROUND
     )
-
-
-def _round(length: float) -> float:
-    """A round number near a length, for a grid."""
-    power = 10.0 ** int(f"{length:e}".partition("e")[2])
-    return power * min((1.0, 2.0, 5.0, 10.0), key=lambda nice: abs(nice - length / power))

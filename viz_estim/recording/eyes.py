@@ -1,4 +1,4 @@
-"""From where a scene is seen at first: whole, and as large as its panel lets it be.
+"""From where a scene is seen at first, whole and as large as its panel lets it be, and the ground beneath it.
 
 The viewer's field of view is some 55° upwards: what is seen at a distance d reaches half of d up and down.
 """
@@ -38,3 +38,19 @@ def bars(count: int) -> rrb.EyeControls3D:
     middle = 0.5 * schema.BAR * (count - 1)
     place = [middle, 0.45, 0.85 + 0.385 * count]
     return rrb.EyeControls3D(position=place, look_target=[middle, 0.45, 0], eye_up=[0, 1, 0], kind="Orbital")
+
+
+def spacing(reach: float) -> float:
+    """The round number of metres between a grid's lines, some eight of them across a scene of that half width (m)."""
+    return _round(max(reach, 0.5) / 4)
+
+
+def ground(reach: float) -> rrb.LineGrid3D:
+    """A grid on the ground of a scene of that half width (m)."""
+    return rrb.LineGrid3D(visible=True, spacing=spacing(reach), color=(45, 46, 50))
+
+
+def _round(length: float) -> float:
+    """A round number near a length."""
+    power = 10.0 ** int(f"{length:e}".partition("e")[2])
+    return power * min((1.0, 2.0, 5.0, 10.0), key=lambda nice: abs(nice - length / power))

@@ -34,7 +34,8 @@ class Layout:
     innovations came from; reach: about how long their readings are; silent: by sensor the steps at which a reading was
     due and none came; true_parts: the parts of the state that have a truth; gapless: those of them that have it at
     every step; particles: how many the belief has; matched: clouds are matched, a registration. position, heading,
-    attitude: the parts that say where and how the body is, if any. ranges: of the plots' axes.
+    attitude: the parts that say where and how the body is, if any. ranges: of the plots' axes. explained: the scenario
+    says itself what to look at.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -46,6 +47,7 @@ class Layout:
         self.gapless = {name for name in self.true_parts if known[name].all()}
         self.duration = scenario.ticks[-1].time - scenario.ticks[0].time
         self.last = len(scenario.ticks) - 1
+        self.explained = bool(scenario.notes)
         parts = self.space.parts.items()
         self.position = next((name for name, part in parts if is_position(part) or isinstance(part, SE2)), None)
         self.heading = next((name for name, part in parts if isinstance(part, (SO2, SE2))), None)

@@ -203,7 +203,7 @@ def _rows(views: Sequence[_Item], widths: list[int] | None = None, most: int = 4
         if groups and len(groups[-1]) + width <= most and width < 3:
             groups[-1] += group
         else:
-            across = 3 if width % 3 == 0 else 4
+            across = 3 if width % 3 == 0 or width == 5 else 4
             groups += [group[i : i + across] for i in range(0, width, across)]
     return [rrb.Horizontal(*group) for group in groups]
 

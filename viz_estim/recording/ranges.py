@@ -92,7 +92,7 @@ def readable(low: float, high: float) -> tuple[float, float]:
     step = 10.0 ** np.ceil(np.log10((high - low) / _NUMBERS))
     above, below = (np.floor(high / step) + 1) * step, (np.ceil(low / step) - 1) * step
     while (above - below) / step < 2.5:  # they are the next ones outside
-        if above - high <= low - below:
+        if above - high <= 1.5 * (low - below):  # about as far: upwards, as in the plots beside it
             high, above = above, above + step
         else:
             low, below = below, below - step
