@@ -69,3 +69,15 @@ def test_an_axis_is_made_anew_once_values_outgrow_it_and_memory_is_bounded() -> 
     ranges.axis("plot")
     assert not ranges.outgrown()
     assert len(ranges._seen["plot"]._low) <= 1024
+
+
+@pytest.mark.parametrize(("scale", "above"), [(1.0, False), (500.0, True)])
+def test_values_that_are_all_above_the_level_lines_are_in_sight(scale: float, above: bool) -> None:
+    ranges, values = Ranges(), scale * np.random.default_rng(0).chisquare(3, 900)
+    ranges.learn("plot", np.full((900, 2), [0.2, 9.3]))
+    ranges.learn("plot", values[:, None])
+    ((low, high),) = ranges.upward("plot", 28.0).range.as_arrow_array().to_pylist()
+    assert low == 0
+    assert (high > 28.0) == above
+    assert np.mean(values <= high) > 0.9
+    assert ranges.upward("never", 28.0).range.as_arrow_array().to_pylist() == [[0, 28.0]]

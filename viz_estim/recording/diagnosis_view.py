@@ -97,7 +97,7 @@ def _innovations(alone: Alone, ranges: Ranges) -> list[_Plots]:
     for table in alone.run.stages.values():
         for name, part in as_product(table.spaces.get("innovation")).parts.items():
             dof = len(part.axes)
-            top = rrb.ScalarAxis(range=(0.0, 4 * band(dof)[1]))
+            top = ranges.upward(schema.plot("nis", name), 4 * band(dof)[1])
             views = [graph("nis", name, f"NIS {name}", top)]
             for axis, unit in zip(part.axes, part.axis_units, strict=True):
                 views.append(_framed(ranges, "innovation", f"{name}.{axis}", titled(name, axis, shown(unit)[0])))

@@ -47,7 +47,7 @@ class Innovations:
             low, high = (np.full(len(rows.at), bound) for bound in band(found[name].dof))
             path = schema.plot("nis", name)
             self._lines.draw(path, rows.at, "", [("97.5 %", schema.BAND, high), ("2.5 %", schema.BAND, low)])
-            self._lines.broken(f"{path}/value", rows.at, "", ("NIS", colour, found[name].values))
+            self._lines.broken(f"{path}/value", rows.at, "", ("NIS", colour, found[name].values), path)
 
     def _draw_moved(self, rows: StageRows, field: str) -> None:
         """Δ = K·ν split by component of the reading, K[:, j]·ν_j, in σ of the state before."""

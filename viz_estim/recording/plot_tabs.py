@@ -108,7 +108,7 @@ def _health(layout: Layout) -> list[_Item]:
     bands: list[_Item] = []
     for name, space in layout.sensors.items():
         dof = len(space.axes)
-        axis = rrb.ScalarAxis(range=(0.0, 3 * band(dof)[1]))
+        axis = layout.ranges.upward(schema.plot("nis", name), 3 * band(dof)[1])
         title = f"NIS {name}: {dof} expected, 95 % between the lines" if len(layout.sensors) < 3 else f"NIS {name}"
         bands.append(graph("nis", name, title, axis))
     nis = _rows(bands)

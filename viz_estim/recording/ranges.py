@@ -6,11 +6,15 @@ names powers of ten alone where a plot is low, so that an axis from −5 to 5 sa
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import rerun.blueprint as rrb
 
 from viz_estim.core.quaternions import Array
 
+_Range = tuple[float, float]
 _ASIDE = 0.02  # of the values at either end may be out of sight
 _CALM = 2.5  # all is shown where it is no more than this, by what most need
 _ROOM = 0.25  # of what most need, above and below it
@@ -24,7 +28,7 @@ class Ranges:
 
     def __init__(self) -> None:
         self._seen: dict[str, _Seen] = {}
-        self._shown: dict[str, tuple[float, float, float]] = {}
+        self._shown: dict[str, tuple[_Range, Callable[[], _Range | None]]] = {}  # and how it is found anew
         self._rows = self._looked = 0
 
     def learn(self, path: str, values: Array) -> None:
@@ -41,10 +45,19 @@ class Ranges:
     def axis(self, path: str, calm: float = _CALM) -> rrb.ScalarAxis | None:
         """The axis of a plot; none where nothing is known, or all is one value. calm: all is shown where it is no more
         than so many times what most need."""
-        found = self._seen[path].range(calm) if path in self._seen else None
+        return self._axis(path, partial(self._seen[path].range, calm)) if path in self._seen else None
+
+    def upward(self, path: str, top: float) -> rrb.ScalarAxis:
+        """The axis from 0 to `top` of a plot that has level lines, or as far up as its values are, where most of them
+        would be out of sight."""
+        axis = self._axis(path, partial(self._seen[path].upward, top)) if path in self._seen else None
+        return axis or rrb.ScalarAxis(range=(0.0, top))
+
+    def _axis(self, path: str, find: Callable[[], _Range | None]) -> rrb.ScalarAxis | None:
+        found = find()
         if found is None:
             return None
-        self._shown[path] = (*found, calm)
+        self._shown[path] = found, find
         return rrb.ScalarAxis(range=found)
 
     def outgrown(self, more: float = 1.0) -> bool:
@@ -53,9 +66,8 @@ class Ranges:
         if not self._shown or self._rows < more * self._looked:
             return False
         self._looked = self._rows
-        for path, (low, high, calm) in self._shown.items():
-            span = high - low
-            now = self._seen[path].range(calm)
+        for (low, high), find in self._shown.values():
+            span, now = high - low, find()
             if now and (max(low - now[0], now[1] - high) > 0.08 * span or now[1] - now[0] < 0.6 * span):
                 return True
         return False
@@ -77,7 +89,12 @@ class _Seen:
         while len(self._low) > _KEPT:
             self._low, self._high, self._stride = self._low[::2], self._high[::2], 2 * self._stride
 
-    def range(self, calm: float) -> tuple[float, float] | None:
+    def upward(self, top: float) -> _Range:
+        ordered = np.sort(self._high)  # with a level line each half of them is that line's
+        middle, most = (float(ordered[int(share * (len(ordered) - 1))]) for share in (0.75, 0.98))
+        return (0.0, top) if middle <= top else (0.0, readable(0.0, most)[1])
+
+    def range(self, calm: float) -> _Range | None:
         least, most = self._all
         aside = int(_ASIDE * len(self._low))
         low, high = float(np.sort(self._low)[aside]), float(np.sort(self._high)[-1 - aside])
@@ -87,7 +104,7 @@ class _Seen:
         return readable(least, most) if most - least > 1e-9 * max(abs(least), abs(most)) else None
 
 
-def readable(low: float, high: float) -> tuple[float, float]:
+def readable(low: float, high: float) -> _Range:
     """The same range, made longer where fewer than two multiples of a power of ten would be named on it."""
     step = 10.0 ** np.ceil(np.log10((high - low) / _NUMBERS))
     above, below = (np.floor(high / step) + 1) * step, (np.ceil(low / step) - 1) * step
