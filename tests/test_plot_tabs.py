@@ -7,7 +7,8 @@ import pytest
 import rerun.blueprint as rrb
 
 from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product
-from viz_estim.recording import plot_tabs
+from viz_estim.recording import blueprints, plot_tabs
+from viz_estim.recording.ranges import Ranges
 
 XYZ = ("x", "y", "z")
 
@@ -17,7 +18,7 @@ def layout(space: Product, **known: Any) -> Any:
     nothing = {"labels": (), "stages": {"update": {"gain": {"shape": [2, 1]}}}, "sensors": {}, "matched": False}
     place = list(known.get("sensors", {})).index
     given = {"particles": 0, "duration": 9.0, "true_parts": list(space.parts), "place": place, "space": space}
-    return SimpleNamespace(**nothing | given | known)
+    return SimpleNamespace(**nothing | given | {"ranges": Ranges()} | known)
 
 
 def names(tabs: list[Any]) -> list[str]:
@@ -39,12 +40,26 @@ def test_a_large_state_has_several_tabs_and_no_crowded_one() -> None:
     state = Product(**parts, attitude=SO3(), gyro_bias=Euclidean(XYZ, "rad/s"))
     tabs = plot_tabs.tabs(layout(state, sensors={"pose": Product(position=Euclidean(XYZ, "m"), attitude=SO3())}))
     assert names(tabs) == [
-        "Innovations", "Errors", "State: estimate amber, truth white", "State 2", "σ", "What moved it",
-        "What moved it 2",
+        "Innovations, ±3σ grey", "Errors, ±3σ grey", "Errors 2", "State: estimate amber, truth white", "State 2", "σ",
+        "What moved it, in σ before", "What moved it 2",
     ]  # fmt: skip
-    assert max(len(tab.contents) for tab in tabs) <= 5
+    assert max(len(tab.contents) for tab in tabs) <= 3
     assert sum(len(plots(tab)) for tab in tabs if tab.name.startswith("State")) == len(state.names)
-    assert legends(tabs) == ["position σ [m]", "K·ν on position x [σ before]"]  # the others' axes are the same
+    assert legends(tabs) == ["position σ [m]", "K·ν on position x [σ]"]  # the others' axes are the same
+
+
+def test_errors_and_nis_come_first_and_innovations_stand_beside_them_where_there_is_room() -> None:
+    sensors = {"accel": Euclidean(XYZ, "m/s²"), "gyro": Euclidean(XYZ, "rad/s")}
+    first, second, *_ = plot_tabs.tabs(layout(Product(attitude=SO3()), sensors=sensors))
+    assert [[view.name for view in row.contents] for row in first.contents] == [
+        [f"attitude {axis} error [deg]" for axis in XYZ],
+        ["NIS accel: 3 expected, 95 % between the lines", "NIS gyro: 3 expected, 95 % between the lines"],
+    ]
+    assert second.name.startswith("Innovations")
+    only = plot_tabs.tabs(layout(Product(attitude=SO3()), sensors={"accel": sensors["accel"]}))[0]
+    assert [len(row.contents) for row in only.contents] == [3, 3, 1]
+    pose = Product(position=Euclidean(("x", "y"), "m"), heading=SO2())
+    assert [len(row.contents) for row in plot_tabs.tabs(layout(pose))[0].contents] == [3]
 
 
 def test_a_small_state_has_its_sigma_beneath_it_and_names_who_reads_it() -> None:
@@ -94,3 +109,20 @@ def test_single_numbers_stand_one_below_the_other_and_are_named_in_words() -> No
     ]  # fmt: skip
     plain = layout(Product(x=Euclidean(["x"])), stages={"update": {"ess": one, "rmse": one}}, true_parts=[])
     assert [view.name for view in plots(plot_tabs.tabs(plain)[0])] == ["update: ess", "update: rmse"]
+
+
+@pytest.mark.parametrize("count", range(1, 7))
+def test_lanes_are_whole_in_a_small_window_and_leave_the_plots_half_of_it(count: int) -> None:
+    share = plot_tabs.lanes_share(count)
+    head, foot, title, ruler, lane = 37, 31, 27, 20, 40  # pixels, measured in a picture of 1280 x 720
+    assert share == 0.5 or share * (720 - head - foot) >= title + ruler + count * lane
+    assert share <= 0.5
+
+
+def test_a_run_that_says_not_what_to_look_at_is_explained_in_a_few_lines() -> None:
+    pose = layout(Product(pose=SE2()), explained=False, attitude=None)
+    text = blueprints.legend(pose)
+    assert "NIS" in text
+    assert len(text) < 600
+    assert "NIS" not in blueprints.legend(layout(Product(pose=SE2()), explained=True, attitude=None))
+    assert "NIS" not in blueprints.legend(layout(Product(pose=SE2()), explained=False, attitude=None, particles=9))

@@ -347,6 +347,13 @@ def test_a_reading_of_a_place_is_drawn_where_it_was_told_alone(kind: str, told_o
     drawn = [place for row in gps_drawn(tmp_path / "a.rrd") for place in row]
     expected = [] if told_of == "residual" else [[10.1 + k, 4.8, 0.0] for k in range(20)]
     np.testing.assert_allclose(drawn, expected, atol=1e-5)
+    plotted = [
+        value
+        for chunk in RrdReader(tmp_path / "a.rrd").stream()
+        if chunk.entity_path == "/plots/state/position.x/reading" and not chunk.is_static
+        for value in chunk.to_record_batch().column("Measurements:values").flatten().to_pylist()
+    ]
+    np.testing.assert_allclose(plotted, [x for x, _, _ in expected], atol=1e-9)
 
 
 def test_a_reading_that_was_expected_at_the_origin_is_drawn(tmp_path: Path) -> None:

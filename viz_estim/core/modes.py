@@ -15,6 +15,7 @@ _ROUNDS = 30
 _REACH = 5.0  # σ either way: a mode of weight p lies at most 1/√p away
 _SMOOTH = 2.0  # cells to a kernel's σ
 _TRUSTED = 100.0  # after a resampling the ESS counts copies: no finer a kernel than for so many draws
+_PAST = 2.0  # times as far from the rest of its mode as from another's mean: a piece that is no part of it
 _VALLEY = 0.7  # of the lower peak: peaks that the density between them does not fall below are one mode
 
 
@@ -67,7 +68,10 @@ def modes(space: Space, states: Array, log_weights: Array, least: float = 0.05) 
     of either), a histogram smoothed with Silverman's width (1986, eq. 4.14): each cell climbs to its peak, and peaks
     without a valley between them are one mode. So are clouds that differ in heading alone.
     """
-    return _described(space, states, log_weights, *_apart(space, states, log_weights), least)
+    label, share = _apart(space, states, log_weights)
+    if int((share >= least).sum()) > 1:
+        label, share = _parted(space, states, log_weights, label, share, least)
+    return _described(space, states, log_weights, label, share, least)
 
 
 def several(space: Space, states: Array, log_weights: Array, least: float = 0.05) -> tuple[Mode, ...]:
@@ -75,7 +79,29 @@ def several(space: Space, states: Array, log_weights: Array, least: float = 0.05
     label, share = _apart(space, states, log_weights)
     if int((share >= least).sum()) < 2:
         return ()
-    return _described(space, states, log_weights, label, share, least)
+    return _described(space, states, log_weights, *_parted(space, states, log_weights, label, share, least), least)
+
+
+def _parted(
+    space: Space, states: Array, log_weights: Array, label: np.ndarray, share: Array, least: float
+) -> tuple[np.ndarray, Array]:
+    """The modes anew, where one of several reaches past another: the kernel is as wide as they all are apart, and may
+    join a few particles beside one mode to a second far off. Looked at alone, with a kernel of its own width, such a
+    one falls into pieces of which one is far nearer to another mode's mean than to the rest of its own."""
+    weights, points = np.exp(log_weights), _points(space, states, log_weights)
+    found, large = label.copy(), np.flatnonzero(share >= least)
+    means = {i: weights[label == i] @ points[label == i] / share[i] for i in large}
+    for i in large:
+        members = np.flatnonzero(label == i)
+        piece, size = _apart(space, states[members], log_weights[members] - np.log(share[i]))
+        for j in np.flatnonzero(size * share[i] >= least) if len(size) > 1 else ():
+            mine, rest = members[piece == j], members[piece != j]
+            middle = weights[mine] @ points[mine] / weights[mine].sum()
+            own = np.linalg.norm(middle - weights[rest] @ points[rest] / weights[rest].sum())
+            if own > _PAST * min(float(np.linalg.norm(middle - means[other])) for other in large if other != i):
+                found[mine] = found.max() + 1
+                break
+    return found, np.bincount(found, weights).astype(float)
 
 
 def _described(
@@ -92,11 +118,16 @@ def _described(
 def _apart(space: Space, states: Array, log_weights: Array) -> tuple[np.ndarray, Array]:
     """The number of each particle's mode (N,), and their shares of the weight."""
     weights = np.exp(log_weights)
-    metres = [i for i, unit in enumerate(space.units) if unit == "m"]
-    points = states[:, metres] if metres else space.minus(states, moments(space, states, log_weights)[0])
-    cell, density = _histogram(points[:, :3], weights)
+    cell, density = _histogram(_points(space, states, log_weights), weights)
     label = _basins(density)[cell]
     return label, np.bincount(label, weights).astype(float)
+
+
+def _points(space: Space, states: Array, log_weights: Array) -> Array:
+    """Where the particles are (N, d), in three directions at most."""
+    metres = [i for i, unit in enumerate(space.units) if unit == "m"]
+    points = states[:, metres] if metres else space.minus(states, moments(space, states, log_weights)[0])
+    return points[:, :3]
 
 
 def _histogram(points: Array, weights: Array) -> tuple[np.ndarray, Array]:

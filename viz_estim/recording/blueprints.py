@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import rerun.blueprint as rrb
 
-from viz_estim.recording import pictures, plot_tabs, schema
+from viz_estim.recording import eyes, pictures, plot_tabs, schema
 from viz_estim.recording.layout import Layout
 from viz_estim.recording.plot_tabs import unit_of
 from viz_estim.recording.scenes import own_scene
@@ -20,10 +20,10 @@ def build(layout: Layout) -> rrb.Blueprint:
     lanes = plot_tabs.lanes(schema.LANES, "Lanes: stage, and what became of each sensor's reading")
     notes = rrb.TextDocumentView(origin=schema.NOTES, name="What to look at")
     left: list[_Item] = [*scenes, notes]
-    shares: list[float] = {1: [1.0], 2: [2.6, 1.0], 3: [3.0, 2.0, 1.6]}[len(left)]
+    shares: list[float] = {1: [1.0], 2: [2.1, 1.0], 3: [3.0, 1.9, 2.0]}[len(left)]
     if layout.camera:
-        shares = [2.3, 2.4, 1.6]  # the unrolled sphere is twice as wide as high
-    low = min(0.4, 0.054 + 0.044 * (len(layout.inputs) + 1 + bool(layout.labels)))  # a lane is some 37 pixels high
+        shares = [2.0, 2.2, 2.1]  # the unrolled sphere is twice as wide as high
+    low = plot_tabs.lanes_share(len(layout.inputs) + 1 + bool(layout.labels))
     whole = rrb.Horizontal(
         rrb.Vertical(*left, row_shares=shares),
         rrb.Vertical(plots, lanes, row_shares=[1 - low, low]),
@@ -53,7 +53,24 @@ def legend(layout: Layout) -> str:
             said += ", each sensor has its own; red, green and blue are the axes x, y, z"
         elif not layout.particles:
             said += ", each sensor has its own"
-    return f"**Colours:** {said}. On the `stage` timeline each stage shows what it alone drew."
+    colours = f"**Colours:** {said}. On the `stage` timeline each stage shows what it alone drew."
+    return colours if layout.explained or layout.labels or layout.matched else f"{_guide(layout)}\n\n{colours}"
+
+
+def _guide(layout: Layout) -> str:
+    """How the first tab is read, where nobody says what to look at."""
+    said = ["An **error** outside its grey ±3σ: the filter is surer than it has reason to be."] * bool(
+        layout.true_parts
+    )
+    if layout.particles:
+        said.append("A cloud of few distinct particles is as good as lost.")
+    else:
+        said += [
+            "**NIS** mostly above its upper line says the same, mostly near 0 that it trusts its readings too little.",
+            "An innovation off zero on one side: something systematic is left out.",
+            "*What moved it* says which reading pulled the estimate.",
+        ]
+    return " ".join(said)
 
 
 def _scenes(layout: Layout) -> list[_Item]:
@@ -62,23 +79,20 @@ def _scenes(layout: Layout) -> list[_Item]:
     truth = ", truth white" if layout.true_parts else ""
     first: list[_Item] = []
     if layout.labels:
-        middle = 0.5 * schema.BAR * (len(layout.labels) - 1)
-        eye = rrb.EyeControls3D(
-            position=[middle, 0.45, 1.3 + 0.35 * len(layout.labels)], look_target=[middle, 0.45, 0],
-            eye_up=[0, 1, 0], kind="Orbital",
-        )  # fmt: skip
         name = "Belief: the probability of each label at this moment"
         first.append(rrb.Spatial3DView(
-            origin=schema.BARS, name=name, eye_controls=eye, line_grid=False, background=_BACKGROUND
+            origin=schema.BARS, name=name, eye_controls=eyes.bars(len(layout.labels)), line_grid=False,
+            background=_BACKGROUND,
         ))  # fmt: skip
     if layout.position:
-        kind = "Plan from above" if layout.planar else "World"
+        assert layout.extent
+        kind = f"{'Plan' if layout.planar else 'World'}, grid {eyes.spacing(layout.extent[1]):g} m"
         title = f"estimate amber with 3σ{truth}, before the update grey"
         if layout.particles:
             title = f"particles blue (light) to amber (heavy), modes yellow{truth}"
         elif layout.matched:
             title = "moved cloud amber, fixed grey, pairs blue (near) to red (far)"
-        first.append(_world(layout, f"{kind} [m]: {title}"))
+        first.append(_world(layout, f"{kind}: {title}"))
     second: list[_Item] = [*pictures.views(layout)]
     if layout.attitude and not layout.matched:
         title = f"Attitude: estimate amber{truth}{', sigma points on the sphere' if points else ''}"
@@ -87,7 +101,7 @@ def _scenes(layout: Layout) -> list[_Item]:
         if own_scene(layout, name):
             colour, _ = schema.sensor_colour(layout.place(name))
             title = f"{name}{unit_of(space, 0, space.units)}: measured {colour}, predicted amber"
-            second.append(_scene(schema.sensor(name), title, layout.reach[name]))
+            second.append(_scene(schema.sensor(name), title, 0.87 * layout.reach[name]))  # it has no axes outside
     if second:
         first.append(rrb.Tabs(*second, active_tab=0) if len(second) > 1 else second[0])
     return first
@@ -96,32 +110,21 @@ def _scenes(layout: Layout) -> list[_Item]:
 def _world(layout: Layout, name: str) -> rrb.Spatial3DView:
     """The world, whole at first; a plan is seen from above. Trails reach back to the start."""
     assert layout.extent
-    (x, y, z), reach = layout.extent
-    if layout.planar:
-        eye = rrb.EyeControls3D(position=[x, y, 2.5 * reach], look_target=[x, y, 0], eye_up=[0, 1, 0], kind="Orbital")
-    else:
-        place = [x + 1.5 * reach, y - 1.85 * reach, z + 1.25 * reach]
-        eye = rrb.EyeControls3D(position=place, look_target=[x, y, z], eye_up=[0, 0, 1], kind="Orbital")
+    centre, reach = layout.extent
+    eye = eyes.above(centre, 2.5 * reach) if layout.planar else eyes.aside(centre, layout.half_sizes)
     start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     since = [rrb.VisibleTimeRange(timeline, start=start, end=now) for timeline in ("step", "time", "stage")]
     return rrb.Spatial3DView(
         origin=schema.WORLD,
         name=name,
         eye_controls=eye,
-        line_grid=rrb.LineGrid3D(visible=True, spacing=_round(reach / 4), color=(45, 46, 50)),
+        line_grid=eyes.ground(reach),
         background=_BACKGROUND,
         overrides={f"{schema.WORLD}/{of}/trail": [rrb.VisibleTimeRanges(since)] for of in ("estimate", "truth")},
     )
 
 
 def _scene(origin: str, name: str, size: float) -> rrb.Spatial3DView:
-    eye = rrb.EyeControls3D(
-        position=[1.6 * size, -1.9 * size, 1.1 * size], look_target=[0, 0, 0], eye_up=[0, 0, 1], kind="Orbital"
+    return rrb.Spatial3DView(
+        origin=origin, name=name, eye_controls=eyes.around(size), line_grid=False, background=_BACKGROUND
     )
-    return rrb.Spatial3DView(origin=origin, name=name, eye_controls=eye, line_grid=False, background=_BACKGROUND)
-
-
-def _round(length: float) -> float:
-    """A round number near a length, for a grid."""
-    power = 10.0 ** int(f"{length:e}".partition("e")[2])
-    return power * min((1.0, 2.0, 5.0, 10.0), key=lambda nice: abs(nice - length / power))

@@ -18,6 +18,8 @@ from viz_estim.recording.columns import Column, Style, Times, drawn, send, send_
 from viz_estim.recording.layout import Layout, flat3, place_of
 
 _DEFAULT_BODY = (0.6, 0.4, 0.15)
+_PATH: schema.Colour = (185, 185, 185)  # the truth's, thin and so less bright than what stands on it
+_OVER = {"estimate": 0.004, "truth": 0.008}  # a planar body's height by the scene's width: particles don't hide it
 _LINE, _TRAIL, _ARROW, _LANDMARK = -1.2, -1.5, -3.0, -5.0  # radii in points on the screen
 
 
@@ -91,7 +93,10 @@ class Bodies:
             ahead = reach * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
             rows = known & np.isfinite(turn)
             self._style(path, Style(rr.Arrows3D, colors=[colour], radii=[_ARROW]))
-            columns = drawn(rr.Arrows3D, rows.astype(int), len(at), vectors=ahead[rows], origins=place[rows])
+            tails = place[rows]
+            if layout.planar:
+                tails[:, 2] += _OVER[name] * layout.extent[1]
+            columns = drawn(rr.Arrows3D, rows.astype(int), len(at), vectors=ahead[rows], origins=tails)
             self._send(path, at, columns)
         else:
             self._style(path, Style(rr.Points3D, colors=[colour], radii=[2 * _ARROW]))
@@ -169,7 +174,10 @@ class Bodies:
                 )
                 send_static(self._stream, path, points)
             elif isinstance(thing, Path):
-                strip = rr.LineStrips3D([flat3(thing.positions)], colors=[schema.SCENERY], radii=[_LINE / 2])
+                strip = rr.LineStrips3D(
+                    [flat3(thing.positions)], colors=[schema.OTHER_PATH], radii=[_LINE / 2],
+                    labels=[name.replace("_", " ")], show_labels=name != "path",
+                )  # fmt: skip
                 send_static(self._stream, path, strip)
         if layout.position in layout.true_parts and scenario.truth is not None:
             place = place_of(layout.space.parts[layout.position], scenario.truth[:, layout.space.at[layout.position]])
@@ -178,7 +186,7 @@ class Bodies:
             strips = [piece for piece in pieces if np.isfinite(piece).all() and len(piece) > 1]
             if strips:
                 self._way = True
-                way = rr.LineStrips3D(strips, colors=[_dim(schema.TRUTH)], radii=[_LINE / 2])
+                way = rr.LineStrips3D(strips, colors=[_PATH], radii=[_LINE / 2])
                 send_static(self._stream, f"{schema.WORLD}/truth/path", way)
 
     def _style(self, path: str, style: Style) -> None:

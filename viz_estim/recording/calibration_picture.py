@@ -74,9 +74,12 @@ def _broken(values: Array) -> Array:
 
 def _blueprint(names: list[str]) -> rrb.Blueprint:
     def plot(origin: str, title: str) -> rrb.TimeSeriesView:
-        # A set begins with rest, so that the upper left is free; the gyro's error has its free corner at the end.
-        corner = rrb.Corner2D.RightBottom if origin.endswith("gyro/error") else rrb.Corner2D.LeftTop
-        return rrb.TimeSeriesView(origin=origin, name=title, plot_legend=rrb.PlotLegend(corner))
+        # A set begins with rest, so that the upper left is free; one legend is enough, for a colour means one thing.
+        legend = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=origin.endswith("gravity/roll"))
+        angle = origin.rpartition("/")[2]
+        most = {"roll": 185.0, "pitch": 105.0, "yaw": 185.0}.get(angle)  # a hundred is named, even on a low plot
+        axis = rrb.ScalarAxis(range=(-most, most)) if most else None
+        return rrb.TimeSeriesView(origin=origin, name=title, plot_legend=legend, axis_y=axis)
 
     def tab(number: int, name: str) -> rrb.Horizontal:
         columns = [[plot(f"set_{number}/{key}", title) for key, title in plots.items()] for plots in _PLOTS]

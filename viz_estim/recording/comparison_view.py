@@ -10,6 +10,7 @@ import rerun.blueprint as rrb
 from viz_estim.recording import links, plot_tabs, schema
 from viz_estim.recording.compared import Compared
 from viz_estim.recording.pictures import CANVAS, PANORAMA
+from viz_estim.recording.ranges import Ranges
 from viz_estim.recording.scene_views import Scenes, flat, view
 from viz_estim.recording.sheet import Plot
 
@@ -22,14 +23,14 @@ _TABS = {
 }  # fmt: skip
 
 
-def build(runs: list[Compared], scenes: Scenes, plots: list[Plot], notes: str) -> rrb.Blueprint:
+def build(runs: list[Compared], scenes: Scenes, plots: list[Plot], ranges: Ranges, notes: str) -> rrb.Blueprint:
     """Scenes above, by kind in tabs where there are several; plots beneath in tabs, with lanes and the figures."""
     above = _scenes(runs, scenes)
     beneath: list[_Item] = []
     for tab in _TABS:
         if members := [plot for plot in plots if plot.tab == tab]:
             white = ", truth white" if tab == "state" and any(np.isfinite(run.run.truth).any() for run in runs) else ""
-            beneath += _tabs(_TABS[tab] + white, members, len(runs), named=bool(above))
+            beneath += _tabs(_TABS[tab] + white, members, ranges, len(runs), named=bool(above))
     lanes = [
         plot_tabs.lanes(f"{run.path}{schema.LANES}", f"{run.title}: stage, and each sensor's readings") for run in runs
     ]
@@ -67,7 +68,7 @@ def _scenes(runs: list[Compared], scenes: Scenes) -> list[_Item]:
     return found
 
 
-def _tabs(title: str, plots: list[Plot], runs: int, *, named: bool) -> list[_Item]:
+def _tabs(title: str, plots: list[Plot], ranges: Ranges, runs: int, *, named: bool) -> list[_Item]:
     """Plots in rows, those of one part of the state together; in as many tabs as keep them readable.
 
     A legend where a plot has a run that none before it on the tab has; of many runs where that plot has a row for
@@ -91,18 +92,18 @@ def _tabs(title: str, plots: list[Plot], runs: int, *, named: bool) -> list[_Ite
             line = []
             for plot in row:
                 new = not plot.runs <= shown
-                line.append(_plot(plot, legend=new and (runs <= _FEW or len(row) == 1 or not named)))
+                line.append(_plot(plot, ranges, legend=new and (runs <= _FEW or len(row) == 1 or not named)))
                 shown |= plot.runs
             lines.append(rrb.Horizontal(*line))
         found.append(rrb.Vertical(*lines, name=f"{title} {len(found) + 1}" if found else title))
     return found
 
 
-def _plot(plot: Plot, *, legend: bool) -> rrb.TimeSeriesView:
+def _plot(plot: Plot, ranges: Ranges, *, legend: bool) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin=plot.path,
         name=plot.title,
-        axis_y=None if plot.top is None else rrb.ScalarAxis(range=(0.0, plot.top)),
+        axis_y=ranges.axis(plot.path) if plot.top is None else rrb.ScalarAxis(range=(0.0, plot.top)),
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
         plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
     )

@@ -13,42 +13,43 @@ from viz_estim.recording.layout import as_product
 from viz_estim.recording.lines import shown
 from viz_estim.recording.pictures import CANVAS
 from viz_estim.recording.plot_tabs import graph
+from viz_estim.recording.ranges import Ranges
 from viz_estim.recording.scene_views import Scenes, view
 from viz_estim.recording.sheet import titled
 
 FINDINGS = "/findings"
 LIST = f"{FINDINGS}/list"
-_ROWS = 3  # of plots in one tab
+_ROWS = 2  # of plots in one tab
+_LANES = 0.42  # of the height at most: those of the worst findings stand first, and evidence is more to read
 _Item = rrb.Container | rrb.View
 _Plots = list[rrb.TimeSeriesView]
 _NAMES = {schema.WORLD: "World [m]", schema.ATTITUDE: "Attitude", schema.BARS: "Probabilities", CANVAS: "Mosaic [deg]"}
 
 
-def build(alone: Alone, scenes: Scenes, findings: int, markdown: str) -> rrb.Blueprint:
-    """Findings at the left, with a list to jump by where there are any; scene, evidence and lanes at the right."""
+def build(alone: Alone, scenes: Scenes, ranges: Ranges, findings: int, markdown: str) -> rrb.Blueprint:
+    """Findings at the left, above the scene and a list to jump by where there are any; evidence and lanes at the
+    right."""
     columns = [TextLogColumn(kind) for kind in (TextLogColumnKind.LogLevel, TextLogColumnKind.Body)]
-    texts: list[_Item] = [links.panel(FINDINGS, "What is wrong", markdown)]
+    left: list[_Item] = [links.panel(FINDINGS, "What is wrong", markdown)]
+    if spatial := _spatial(alone, scenes):
+        left.append(rrb.Tabs(*spatial, active_tab=0))
     if findings:
         columned = rrb.archetypes.TextLogColumns(text_log_columns=columns)
-        texts.append(rrb.TextLogView(origin=LIST, name="Click a time to go there", columns=columned))
-    lanes = plot_tabs.lanes(schema.LANES, "Lanes: findings, stages, readings")
-    spatial = _spatial(alone, scenes)
+        left.append(rrb.TextLogView(origin=LIST, name="Click a time to go there", columns=columned))
     duration = float(alone.run.time[-1] - alone.run.time[0])
-    tabs = [plot_tabs.show_all(tab, duration) for title, plots in _evidence(alone) for tab in _tabs(title, plots)]
-    right: list[_Item] = [
-        *([rrb.Tabs(*spatial, active_tab=0)] if spatial else []),
-        *([rrb.Tabs(*tabs, active_tab=0)] if tabs else []),
-        lanes,
+    tabs = [
+        plot_tabs.show_all(tab, duration) for title, plots in _evidence(alone, ranges) for tab in _tabs(title, plots)
     ]
     sensors = {name.partition(".")[2] for name in alone.run.inputs if "." in name}
-    count = findings + len(sensors) + 1 + bool(alone.run.labels)  # a lane is some 40 pixels high
-    low = min(0.5, 0.05 + 0.043 * count)
-    parts = [2.0] * bool(spatial) + [3.0] * bool(tabs)  # the evidence is more to read than the scene
-    rest = [(1 - low) * part / sum(parts) for part in parts]
+    low = min(_LANES, plot_tabs.lanes_share(findings + len(sensors) + 1 + bool(alone.run.labels)))
+    right: list[_Item] = [
+        *([rrb.Tabs(*tabs, active_tab=0)] if tabs else []),
+        plot_tabs.lanes(schema.LANES, "Lanes: findings, stages, readings"),
+    ]
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(*texts, row_shares=[3, 1][: len(texts)]),
-            rrb.Vertical(*right, row_shares=[*rest, low]),
+            rrb.Vertical(*left, row_shares=[2.4, *[1.6] * bool(spatial), *[1.0] * bool(findings)]),
+            rrb.Vertical(*right, row_shares=[1 - low, low] if tabs else [1.0]),
             column_shares=[2, 3],
         ),
         rrb.TimePanel(timeline="time", state="collapsed"),
@@ -63,7 +64,7 @@ def _spatial(alone: Alone, scenes: Scenes) -> list[rrb.View]:
         if scene in scenes.runs:
             truth = ", fixed grey" if _registered(alone) else ", truth white" if scene[1:] in scenes.truths else ""
             name = f"{word}: {_shown(alone)} amber{truth}" if scene in (schema.ATTITUDE, schema.WORLD) else word
-            found.append(view(scene, [alone], alone, scenes, name, 2.8))
+            found.append(view(scene, [alone], alone, scenes, name, 2.2))
     return found
 
 
@@ -78,11 +79,11 @@ def _registered(alone: Alone) -> bool:
     return "align" in alone.run.stages
 
 
-def _evidence(alone: Alone) -> list[tuple[str, list[_Plots]]]:
+def _evidence(alone: Alone, ranges: Ranges) -> list[tuple[str, list[_Plots]]]:
     """Tabs by title, each with its plots, those of one thing together."""
     tabs = [
-        ("Innovations", _innovations(alone)),
-        ("Errors", _errors(alone)),
+        ("Innovations", _innovations(alone, ranges)),
+        ("Errors", _errors(alone, ranges)),
         ("Belief", _belief(alone)),
         ("Figures", _figures(alone)),
     ]
@@ -91,29 +92,33 @@ def _evidence(alone: Alone) -> list[tuple[str, list[_Plots]]]:
     return [(title, groups) for title, groups in tabs if groups]
 
 
-def _innovations(alone: Alone) -> list[_Plots]:
+def _innovations(alone: Alone, ranges: Ranges) -> list[_Plots]:
     groups = []
     for table in alone.run.stages.values():
         for name, part in as_product(table.spaces.get("innovation")).parts.items():
             dof = len(part.axes)
-            top = rrb.ScalarAxis(range=(0.0, 4 * band(dof)[1]))
+            top = ranges.upward(schema.plot("nis", name), 4 * band(dof)[1])
             views = [graph("nis", name, f"NIS {name}", top)]
             for axis, unit in zip(part.axes, part.axis_units, strict=True):
-                views.append(graph("innovation", f"{name}.{axis}", titled(name, axis, shown(unit)[0])))
+                views.append(_framed(ranges, "innovation", f"{name}.{axis}", titled(name, axis, shown(unit)[0])))
             groups.append(views)
     return groups
 
 
-def _errors(alone: Alone) -> list[_Plots]:
+def _errors(alone: Alone, ranges: Ranges) -> list[_Plots]:
     run, space = alone.run, alone.space
     return [
         [
-            graph("error", f"{name}.{axis}", titled(name, axis, shown(unit)[0], "error"))
+            _framed(ranges, "error", f"{name}.{axis}", titled(name, axis, shown(unit)[0], "error"))
             for axis, unit in zip(part.axes, part.axis_units, strict=True)
         ]
         for name, part in space.parts.items()
         if np.isfinite(run.truth[:, space.at[name]]).any()
     ]
+
+
+def _framed(ranges: Ranges, group: str, component: str, name: str) -> rrb.TimeSeriesView:
+    return graph(group, component, name, ranges.axis(schema.plot(group, component)))
 
 
 def _belief(alone: Alone) -> list[_Plots]:

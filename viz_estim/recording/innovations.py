@@ -47,7 +47,7 @@ class Innovations:
             low, high = (np.full(len(rows.at), bound) for bound in band(found[name].dof))
             path = schema.plot("nis", name)
             self._lines.draw(path, rows.at, "", [("97.5 %", schema.BAND, high), ("2.5 %", schema.BAND, low)])
-            self._lines.broken(f"{path}/value", rows.at, "", ("NIS", colour, found[name].values))
+            self._lines.broken(f"{path}/value", rows.at, "", ("NIS", colour, found[name].values), path)
 
     def _draw_moved(self, rows: StageRows, field: str) -> None:
         """Δ = K·ν split by component of the reading, K[:, j]·ν_j, in σ of the state before."""
@@ -64,7 +64,8 @@ class Innovations:
         titles = [f"by {name} {axis}" if axis not in ("", name) else f"by {name}" for name, axis in names]
         for i, axis in enumerate(self._layout.space.axes):
             series = list(zip(titles, colours, moved[:, i, :].T, strict=True))
-            self._lines.draw(f"{schema.plot('moved', axis)}/{schema.as_part(rows.name)}", at, "σ", series)
+            plot = schema.plot("moved", axis)
+            self._lines.draw(f"{plot}/{schema.as_part(rows.name)}", at, "σ", series, plot=plot)
 
     def _colour(self, sensor: str) -> schema.Colour:
         return schema.sensor_colour(self._layout.place(sensor))[1]

@@ -21,19 +21,21 @@ from viz_estim.core.scenery import Camera, Cloud, Landmarks, Path
 from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product, Space
 from viz_estim.core.stages import Innovation, Matches, SigmaPoints
 from viz_estim.recording.batch import Batch, StageRows, kinds_of
+from viz_estim.recording.ranges import Ranges
 
 KEPT = 4000  # particles of a cloud at most: more are thinned by weight
 
 
 class Layout:
     """space: the state's, as a product (of nothing, where the belief is over labels); inputs: the sensors on ticks;
-    duration: in s, as far as it is known beforehand.
+    duration: in s, as far as it is known so far; last: the last step, 0 where it is not known beforehand.
 
     stages: per stage the shape (as JSON: a list) or the space of each field; sensors: the spaces of those that
     innovations came from; reach: about how long their readings are; silent: by sensor the steps at which a reading was
     due and none came; true_parts: the parts of the state that have a truth; gapless: those of them that have it at
     every step; particles: how many the belief has; matched: clouds are matched, a registration. position, heading,
-    attitude: the parts that say where and how the body is, if any.
+    attitude: the parts that say where and how the body is, if any. ranges: of the plots' axes. explained: the scenario
+    says itself what to look at.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -44,6 +46,8 @@ class Layout:
         self.true_parts = [name for name, rows in known.items() if rows.any()]
         self.gapless = {name for name in self.true_parts if known[name].all()}
         self.duration = scenario.ticks[-1].time - scenario.ticks[0].time
+        self.last = len(scenario.ticks) - 1
+        self.explained = bool(scenario.notes)
         parts = self.space.parts.items()
         self.position = next((name for name, part in parts if is_position(part) or isinstance(part, SE2)), None)
         self.heading = next((name for name, part in parts if isinstance(part, (SO2, SE2))), None)
@@ -60,6 +64,7 @@ class Layout:
         self.inputs: list[str] = []
         self.sensors: dict[str, Space] = {}
         self.reach: dict[str, float] = {}
+        self.ranges = Ranges()
 
     @property
     def planar(self) -> bool:
@@ -73,6 +78,12 @@ class Layout:
             return None
         low, high = self._box
         return 0.5 * (low + high), max(0.5, float(0.5 * np.abs(high - low).max()))
+
+    @property
+    def half_sizes(self) -> Array:
+        """The half sizes (3,) in m of the box about what is known so far to be in the scene."""
+        assert self._box is not None
+        return 0.5 * (self._box[1] - self._box[0])
 
     def _known_places(self, scenario: Scenario, truth: Array) -> Array:
         """The box (2, 3) about the places that are known beforehand."""
@@ -106,6 +117,7 @@ class Layout:
     def learn(self, batch: Batch) -> bool:
         """Takes in what is new; True where anything is."""
         self._widen(batch)
+        self.duration = max(self.duration, float(batch.times.time[-1]))
         new = False
         for rows in batch.stages:
             if self._unknown.get(rows.name, True):

@@ -11,22 +11,28 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
 from viz_estim.recording import schema
 from viz_estim.recording.columns import Column, Times, drawn, send, send_still, still
+from viz_estim.recording.ranges import Ranges
 
 Series = tuple[str, schema.Colour, Array]  # name, colour, values (N,)
 
 
 class Lines:
-    """Draws series into the plots of a stream, and styles each plot once."""
+    """Draws series into the plots of a stream, and styles each plot once. ranges: learns the values of each plot."""
 
-    def __init__(self, stream: rr.RecordingStream) -> None:
-        self._stream = stream
+    def __init__(self, stream: rr.RecordingStream, ranges: Ranges) -> None:
+        self._stream, self._ranges = stream, ranges
         self._styled: set[str] = set()
         self._known: dict[str, bool] = {}  # by broken line: whether it has a value last
 
-    def draw(self, path: str, at: Times, unit: str, series: list[Series], variance: Array | None = None) -> None:
-        """Lines in one plot, the last on top; the variance (N,) is that one's, drawn as a band."""
+    def draw(
+        self, path: str, at: Times, unit: str, series: list[Series], variance: Array | None = None,
+        plot: str | None = None,
+    ) -> None:  # fmt: skip
+        """Lines in one plot, the last on top; the variance (N,) is that one's, drawn as a band. plot: its path, where
+        these are some of its lines."""
         self._style(path, unit, series)
         components = {"values": np.stack([values for _, _, values in series], axis=1)}
+        self._ranges.learn(plot or path, components["values"])
         if variance is not None:
             components["variances"] = np.zeros_like(components["values"])
             components["variances"][:, -1] = variance
@@ -44,10 +50,11 @@ class Lines:
             self.draw(path, at, unit, [*bounds, scaled])
         else:
             self.draw(path, at, unit, bounds)
-            self.broken(f"{path}/value", at, unit, scaled)
+            self.broken(f"{path}/value", at, unit, scaled, path)
 
-    def broken(self, path: str, at: Times, unit: str, series: Series) -> None:
-        """One line that is broken where its value is NaN: by a row without a value, where the gap begins."""
+    def broken(self, path: str, at: Times, unit: str, series: Series, plot: str | None = None) -> None:
+        """One line that is broken where its value is NaN: by a row without a value, where the gap begins. plot: the
+        path of the plot, where this is one of its lines."""
         name, colour, values = series
         known = np.isfinite(values)
         before = np.concatenate([[self._known.get(path, False)], known[:-1]])
@@ -56,6 +63,7 @@ class Lines:
         if len(rows):
             at, drawn_values = (at, values) if len(rows) == len(at) else (at.pick(rows), values[rows])
             counts = np.isfinite(drawn_values)
+            self._ranges.learn(plot or path, drawn_values[:, None])
             self._style(path, unit, [(name, colour, drawn_values)])
             columns = drawn(rr.Measurements, counts.astype(int), len(at), values=drawn_values[counts])
             send(self._stream, path, at, columns)

@@ -22,6 +22,7 @@ from viz_estim.recording import diagnosis_view, schema
 from viz_estim.recording.columns import Times, send_static
 from viz_estim.recording.compared import Alone
 from viz_estim.recording.diagnosis_view import FINDINGS, LIST
+from viz_estim.recording.ranges import Ranges
 from viz_estim.recording.reader import Run
 from viz_estim.recording.rescue import whole
 from viz_estim.recording.scene_views import Scenes
@@ -52,25 +53,30 @@ def write(source: Path, path: Path, run: Run, marks: list[Mark], markdown: str) 
         stream.save(aside)
         stream.send_recording_name(f"{run.properties.get('title', source.stem)} · diagnosis")
         stream.flush()  # what is logged so far comes before all chunks
-        alone, scenes = Alone(run, 0, source.stem, True), Scenes()
+        alone, scenes, ranges = Alone(run, 0, source.stem, True), Scenes(), Ranges()
         with whole(source) as sound:
-            rr.send_chunks(_chunks(sound, alone, scenes), recording=stream)
+            rr.send_chunks(_chunks(sound, alone, scenes, ranges), recording=stream)
         send_static(stream, FINDINGS, rr.TextDocument(markdown, media_type="text/markdown"))
         for mark in marks:
             _draw_lane(stream, run, mark)
         _draw_list(stream, run, marks)
-        stream.send_blueprint(diagnosis_view.build(alone, scenes, len(marks), markdown))
+        stream.send_blueprint(diagnosis_view.build(alone, scenes, ranges, len(marks), markdown))
         stream.flush()
         stream.disconnect()
 
 
-def _chunks(path: Path, alone: Alone, scenes: Scenes) -> Iterator[Chunk]:
-    """The recording's chunks one after the other; learns which scenes there are."""
+def _chunks(path: Path, alone: Alone, scenes: Scenes, ranges: Ranges) -> Iterator[Chunk]:
+    """The recording's chunks one after the other; learns which scenes there are, and the values of plots."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RerunWarning)  # of a run that was killed
         reader = RrdReader(path)
     for chunk in reader.stream():
         scenes.learn(alone, chunk)
+        if chunk.entity_path.startswith(f"{schema.PLOTS}/") and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            if "Measurements:values" in batch.schema.names:
+                values = batch.column("Measurements:values").flatten().to_numpy(zero_copy_only=False)
+                ranges.learn(chunk.entity_path.removesuffix("/value"), values.reshape(-1, 1))
         yield chunk
 
 

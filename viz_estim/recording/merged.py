@@ -46,7 +46,7 @@ def write(path: Path, runs: list[Compared], result: dict[str, Any], notes: str) 
         send_static(stream, schema.NOTES, rr.TextDocument(notes, media_type="text/markdown"))
         texts = rr.AnyValues(drop_untyped_nones=False, result=json.dumps(result))
         send_static(stream, "/__properties/viz_estim_comparison", texts)
-        stream.send_blueprint(comparison_view.build(runs, scenes, overlays.plots, notes))
+        stream.send_blueprint(comparison_view.build(runs, scenes, overlays.plots, overlays.ranges, notes))
         stream.flush()
         stream.disconnect()
 

@@ -16,11 +16,12 @@ from viz_estim.recording.columns import Times
 from viz_estim.recording.compared import Compared, shared_parts
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.lines import shown
+from viz_estim.recording.ranges import Ranges
 from viz_estim.recording.sheet import Plot, Sheet, titled
 
 
 class Overlays:
-    """Draws the runs' numbers into one stream. `plots` lists what was drawn."""
+    """Draws the runs' numbers into one stream. `plots` lists what was drawn, `ranges` knows their values."""
 
     def __init__(self, stream: rr.RecordingStream, runs: list[Compared]) -> None:
         self._sheet = Sheet(stream, runs)
@@ -29,6 +30,10 @@ class Overlays:
     @property
     def plots(self) -> list[Plot]:
         return list(self._sheet.plots.values())
+
+    @property
+    def ranges(self) -> Ranges:
+        return self._sheet.ranges
 
     def draw(self) -> None:
         self._draw_differences()

@@ -16,9 +16,10 @@ from viz_estim.recording.layout import Layout
 from viz_estim.recording.lines import sigma_plots
 
 _Item = rrb.Container | rrb.View
-_MANY = 5  # rows of plots that one tab holds
-_READABLE = 4  # rows of a tab at most where they can as well be in two
+_READABLE = 3  # rows of plots in a tab: of more, the axes have room for no number but 0
 _MINUTE = 60.0  # s
+_SMALL = 652  # pixels that views have above one another in a window 720 high
+_LANE, _LANES_HEAD = 40, 48  # pixels of a lane with its name, and of what stands above all
 # What the single numbers of our own stages mean, those first that say most.
 _OF_CLOUDS = {
     "evidence": "log-evidence of the reading",
@@ -27,6 +28,7 @@ _OF_CLOUDS = {
 }
 _OF_FITS = {"rmse": "RMSE of the matches [m]", "count": "matches", "converged": "1 when the matches repeat"}
 _COUNTED = ("ess", "distinct")  # of all particles
+_TOPS = {"converged": 1}
 
 
 def figure_names(fields: list[str], *, fit: bool, particles: int | None) -> dict[str, str]:
@@ -40,6 +42,11 @@ def figure_names(fields: list[str], *, fit: bool, particles: int | None) -> dict
 def lanes(origin: str, name: str) -> rrb.StateTimelineView:
     """Lanes, of the whole run."""
     return rrb.StateTimelineView(origin=origin, name=name, time_view=_whole_run())
+
+
+def lanes_share(count: int) -> float:
+    """The share of the height at which so many lanes are whole in a small window, up to half of it."""
+    return min(0.5, (_LANES_HEAD + _LANE * count) / _SMALL)
 
 
 def show_all(item: _Item, duration: float) -> _Item:
@@ -82,44 +89,54 @@ def probabilities() -> rrb.TimeSeriesView:
 
 
 def _health(layout: Layout) -> list[_Item]:
-    """Is the filter right, and does it know: errors, innovations, NIS; in two tabs where one would be crowded."""
-    errors: list[_Item] = []
-    for name, part in layout.space.parts.items():
-        if name in layout.true_parts:
-            views = [
-                graph("error", f"{name}.{axis}", f"{titled(name, axis)} error{unit_of(part, i)} ±3σ")
-                for i, axis in enumerate(part.axes)
-            ]
-            errors += _rows(views)
+    """Is the filter right, and does it know: errors, innovations, NIS; the innovations in a tab of their own where one
+    would be crowded, and NIS with them where the errors alone crowd one."""
+    parts = [(name, part) for name, part in layout.space.parts.items() if name in layout.true_parts]
+    views: list[_Item] = [
+        _framed(layout, "error", f"{name}.{axis}", f"{titled(name, axis)} error{unit_of(part, i)}")
+        for name, part in parts
+        for i, axis in enumerate(part.axes)
+    ]
+    errors = _rows(views, [len(part.axes) for _, part in parts], most=3)
     what = " innov." if len(layout.sensors) < 4 else ""  # four in a row leave no place for the word
     views = [
-        graph("innovation", f"{name}.{axis}", f"{titled(name, axis)}{what}{unit_of(space, i)} ±3σ")
+        _framed(layout, "innovation", f"{name}.{axis}", f"{titled(name, axis)}{what}{unit_of(space, i)}")
         for name, space in layout.sensors.items()
         for i, axis in enumerate(space.axes)
     ]
-    widths = [len(space.axes) for space in layout.sensors.values()]
-    innovations = _rows(views, widths)
-    if layout.sensors:
-        bands = []
-        for name, space in layout.sensors.items():
-            dof = len(space.axes)
-            axis = rrb.ScalarAxis(range=(0.0, 3 * band(dof)[1]))
-            title = f"NIS {name}: {dof} expected, 95 % between the lines" if len(layout.sensors) < 3 else f"NIS {name}"
-            bands.append(graph("nis", name, title, axis))
-        innovations += _rows(bands)
-    if len(errors) + len(innovations) > _MANY and errors and innovations:
-        return [rrb.Vertical(*innovations, name="Innovations"), rrb.Vertical(*errors, name="Errors")]
-    rows = [*errors, *innovations]
-    return [rrb.Vertical(*rows, name="Consistency")] if rows else []
+    innovations = _rows(views, [len(space.axes) for space in layout.sensors.values()])
+    bands: list[_Item] = []
+    for name, space in layout.sensors.items():
+        dof = len(space.axes)
+        axis = layout.ranges.upward(schema.plot("nis", name), 3 * band(dof)[1])
+        title = f"NIS {name}: {dof} expected, 95 % between the lines" if len(layout.sensors) < 3 else f"NIS {name}"
+        bands.append(graph("nis", name, title, axis))
+    nis = _rows(bands)
+    whole, bounds = "Consistency", ", ±3σ grey"
+    if len(errors) + len(innovations) + len(nis) <= _READABLE:
+        rows = [*errors, *innovations, *nis]
+        return [rrb.Vertical(*rows, name=whole + bounds)] if rows else []
+    if errors and len(errors) + len(nis) <= _READABLE:
+        return [
+            rrb.Vertical(*errors, *nis, name=whole + bounds),
+            *_in_tabs(innovations, "Innovations" + bounds, "Innovations"),
+        ]
+    return [
+        *_in_tabs([*innovations, *nis], "Innovations" + bounds, "Innovations"),
+        *_in_tabs(errors, "Errors" + bounds, "Errors"),
+    ]
 
 
 def _figures(layout: Layout) -> list[_Item]:
     """The single numbers of stages, over time: one below the other, so that their times are."""
-    views = []
+    views: list[_Item] = []
     for stage, fields in layout.stages.items():
         numbers = [field for field, what in fields.items() if what.get("shape") == []]
         named = figure_names(numbers, fit=layout.matched, particles=layout.particles or None)
-        views += [graph("figure", f"{stage}.{field}", f"{stage}: {name}") for field, name in named.items()]
+        for field, words in named.items():
+            top = _TOPS.get(field) if layout.matched else layout.particles if field in _COUNTED else None
+            axis = rrb.ScalarAxis(range=(-0.03 * top, 1.03 * top)) if top else None
+            views.append(_framed(layout, "figure", f"{stage}.{field}", f"{stage}: {words}", axis))
     across = -(-len(views) // _READABLE)
     rows = [rrb.Horizontal(*views[i : i + across]) for i in range(0, len(views), max(across, 1))]
     return [rrb.Vertical(*rows, name="Figures")] if rows else []
@@ -127,13 +144,13 @@ def _figures(layout: Layout) -> list[_Item]:
 
 def _state(layout: Layout) -> list[_Item]:
     """What the filter says: every component of the state, and its σ beneath, or where that is much in tabs apart."""
-    rows: list[_Item] = []
-    for name, part in layout.space.parts.items():
-        views = [
-            graph("state", f"{name}.{component}", f"{titled(name, component)}{unit_of(part, i, part.units)}")
-            for i, component in enumerate(part.names)
-        ]
-        rows += _rows(views)
+    parts = layout.space.parts.items()
+    views = [
+        _framed(layout, "state", f"{name}.{component}", f"{titled(name, component)}{unit_of(part, i, part.units)}")
+        for name, part in parts
+        for i, component in enumerate(part.names)
+    ]
+    rows = _rows(views, [len(part.names) for _, part in parts], most=3)
     sigmas = _rows(_sigmas(layout))
     colours = ["estimate amber", *(["truth white"] if layout.true_parts else []), *_readings(layout)]
     name = f"State: {', '.join(colours)}"
@@ -156,14 +173,15 @@ def _moved(layout: Layout) -> list[_Item]:
     """Which reading moved which direction of the state, in σ of the state before."""
     if not any("gain" in fields for fields in layout.stages.values()):
         return []
-    rows: list[_Item] = []
-    for name, part in layout.space.parts.items():
-        views = [
-            graph("moved", f"{name}.{axis}", f"K·ν on {titled(name, axis)} [σ before]", legend=not rows and i == 0)
-            for i, axis in enumerate(part.axes)
-        ]
-        rows += _rows(views)
-    return _in_tabs(rows, "What moved it", "What moved it")
+    parts = layout.space.parts.items()
+    views: list[_Item] = []
+    for name, part in parts:
+        for axis in part.axes:
+            views.append(
+                _framed(layout, "moved", f"{name}.{axis}", f"K·ν on {titled(name, axis)} [σ]", legend=not views)
+            )
+    rows = _rows(views, [len(part.axes) for _, part in parts], most=3)
+    return _in_tabs(rows, "What moved it, in σ before", "What moved it")
 
 
 def _in_tabs(rows: list[_Item], first: str, others: str) -> list[_Item]:
@@ -174,17 +192,18 @@ def _in_tabs(rows: list[_Item], first: str, others: str) -> list[_Item]:
     return [rrb.Vertical(*part, name=f"{others} {i}" if i > 1 else first) for i, part in enumerate(parts, 1)]
 
 
-def _rows(views: Sequence[_Item], widths: list[int] | None = None) -> list[_Item]:
-    """The views in rows of at most four; those that belong together (`widths` of them) stay in one row."""
+def _rows(views: Sequence[_Item], widths: list[int] | None = None, most: int = 4) -> list[_Item]:
+    """The views in rows of at most four; those that belong together (`widths` of them) stay in one row, and few of them
+    join the row before if that makes at most `most`."""
     groups: list[list[_Item]] = []
     start = 0
     for width in widths or [len(views)]:
         group = list(views[start : start + width])
         start += width
-        if groups and len(groups[-1]) + width <= 4 and width < 3:
+        if groups and len(groups[-1]) + width <= most and width < 3:
             groups[-1] += group
         else:
-            across = 3 if width % 3 == 0 else 4
+            across = 3 if width % 3 == 0 or width == 5 else 4
             groups += [group[i : i + across] for i in range(0, width, across)]
     return [rrb.Horizontal(*group) for group in groups]
 
@@ -197,9 +216,20 @@ def _sigmas(layout: Layout) -> list[_Item]:
         for plot, at in sigma_plots(name, part).items():
             axes = tuple(part.axes[i] for i in at)
             several = len(axes) > 1
-            views.append(graph("sigma", plot, f"{name} σ{unit_of(part, at[0])}", legend=several and axes != named))
+            views.append(
+                _framed(layout, "sigma", plot, f"{name} σ{unit_of(part, at[0])}", legend=several and axes != named)
+            )
             named = axes if several else named
     return views
+
+
+def _framed(
+    layout: Layout, group: str, component: str, name: str, axis: rrb.ScalarAxis | None = None, *, legend: bool = False
+) -> rrb.TimeSeriesView:
+    """A plot whose axis, unless it is given, shows most of its values; of some the jumps are what they have to say."""
+    jumps = [10.0] * (group in ("moved", "figure"))
+    axis = axis or layout.ranges.axis(schema.plot(group, component), *jumps)
+    return graph(group, component, name, axis, legend=legend)
 
 
 def graph(

@@ -7,14 +7,15 @@ import rerun as rr
 
 from viz_estim.core.descriptions import describe
 from viz_estim.core.quaternions import Array
-from viz_estim.core.run import Step, Tick
+from viz_estim.core.run import Tick
 from viz_estim.core.spaces import SO3, Euclidean, Space
-from viz_estim.recording import schema
+from viz_estim.recording import blueprints, schema
 from viz_estim.recording.batch import Batch
 from viz_estim.recording.columns import Times, drawn, send, send_static, words
 from viz_estim.recording.innovations import Innovations
 from viz_estim.recording.layout import Layout
 from viz_estim.recording.lines import Lines, Series, shown, sigma_plots
+from viz_estim.recording.readings import told
 
 
 class Plots:
@@ -22,7 +23,7 @@ class Plots:
 
     def __init__(self, stream: rr.RecordingStream, layout: Layout) -> None:
         self._stream, self._layout = stream, layout
-        self._lines = Lines(stream)
+        self._lines = Lines(stream, layout.ranges)
         self._innovations = Innovations(self._lines, layout)
         self._styled: set[str] = set()
         self._states: dict[str, str] = {}  # by lane: what it shows last
@@ -38,6 +39,13 @@ class Plots:
         gated = self._innovations.add(batch)
         for sensor in self._layout.inputs:
             self._draw_health(batch, sensor, gated.get(sensor, set()))
+        self._frame(batch)
+
+    def _frame(self, batch: Batch) -> None:
+        """Sends the view anew where axes are to be others by now: at the end for certain, before it now and then."""
+        ended = batch.times.step[-1] == self._layout.last or batch.steps[-1].error
+        if self._layout.ranges.outgrown(1.0 if ended else 1.8 if self._layout.last else 1.1):
+            self._stream.send_blueprint(blueprints.build(self._layout))
 
     def _draw_states(self, batch: Batch) -> None:
         """The belief at the end of each step, by part: its components, its σ, its error."""
@@ -48,7 +56,7 @@ class Plots:
         space = self._layout.space
         for name, part in space.parts.items():
             x, true, var = mean[:, space.at[name]], truth[:, space.at[name]], variance[:, space.axes_at[name]]
-            self._plot_state(name, part, at, x, true, var, [batch.steps[i] for i in row.tolist()])
+            self._plot_state(name, part, at, x, true, var, self._direct_reading(batch, name, part))
             sigma, colours = np.sqrt(np.maximum(var, 0)), schema.line_colours(len(part.axes))
             for plot, axes in sigma_plots(name, part).items():
                 unit, scale = shown(part.axis_units[axes[0]])
@@ -62,11 +70,10 @@ class Plots:
                     self._lines.within(path, at, part.axis_units[i], line, var[:, i], gapless=gapless)
 
     def _plot_state(
-        self, name: str, part: Space, at: Times, x: Array, true: Array, var: Array, steps: list[Step]
+        self, name: str, part: Space, at: Times, x: Array, true: Array, var: Array, reading: tuple[str, Array] | None
     ) -> None:
         """Each component: the estimate with ±1σ where it has one of its own, the truth, and who reads it directly."""
         own_sigma = len(part.names) == len(part.axes)
-        reading = self._direct_reading(part, steps)
         if isinstance(part, SO3):
             # q and −q are one rotation: the truth is shown on the estimate's side.
             true = true * np.copysign(1.0, np.nansum(true * x, axis=1, keepdims=True))
@@ -76,21 +83,29 @@ class Plots:
             series: list[Series] = []
             if reading is not None:
                 read = (reading[0], self._colour(reading[0]), scale * reading[1][:, i])
-                self._lines.broken(f"{path}/reading", at, unit, read)
+                self._lines.broken(f"{path}/reading", at, unit, read, path)
             true_line = ("truth", schema.TRUTH, scale * true[:, i])
             if name in self._layout.gapless:
                 series.append(true_line)
             series.append(("estimate", schema.ESTIMATE, scale * x[:, i]))
             self._lines.draw(path, at, unit, series, scale**2 * var[:, i] if own_sigma else None)
             if name in self._layout.true_parts and name not in self._layout.gapless:
-                self._lines.broken(f"{path}/truth", at, unit, true_line)
+                self._lines.broken(f"{path}/truth", at, unit, true_line, path)
 
-    def _direct_reading(self, part: Space, steps: list[Step]) -> tuple[str, Array] | None:
-        """The sensor that reads this part of the state as it is (a gyro reads the rate), and its readings."""
-        for name, space in self._layout.sensors.items():
+    def _direct_reading(self, batch: Batch, name: str, part: Space) -> tuple[str, Array] | None:
+        """The sensor that reads this part of the state as it is (a gyro reads the rate), and its readings by step."""
+        for sensor, space in self._layout.sensors.items():
             if isinstance(part, Euclidean) and any(part.units) and describe(space) == describe(part):
                 nothing = np.full(len(part.names), np.nan)
-                return name, np.array([step.tick.measurements.get(name, nothing) for step in steps])
+                read = np.array(
+                    [batch.steps[i].tick.measurements.get(sensor, nothing) for i in batch.end_rows.tolist()]
+                )
+                for rows in batch.stages:
+                    for field, what in self._layout.stages[rows.name].items():
+                        if "innovation" in what and sensor in getattr(rows.stages[0], field).space.parts:
+                            untold = rows.at.step[~told(self._layout, rows, field, sensor, name)]
+                            read[np.isin(batch.times.step[batch.end_rows], untold)] = np.nan
+                return sensor, read
         return None
 
     def _draw_figures(self, batch: Batch) -> None:

@@ -10,7 +10,7 @@ from rerun.chunk import Chunk
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, Space
-from viz_estim.recording import schema
+from viz_estim.recording import eyes, schema
 from viz_estim.recording.compared import Compared
 from viz_estim.recording.layout import flat3, is_position, place_of
 from viz_estim.recording.pictures import CANVAS, PANORAMA
@@ -21,14 +21,14 @@ _NO_SCENES = {"stages", "steps", "events", "lanes", "plots", "notes", "findings"
 
 class Scenes:
     """What the recordings draw in space, learnt from their chunks: by scene (`/world`, `/sensors/accel`), which runs
-    move something in it; truths: the scenes that have the first run's truth; standing: places (M, 3) in the world of
-    what stands still; sizes: by scene and run a sphere's radius, or the height of an unrolled one."""
+    move something in it; truths: the scenes that have the first run's truth; standing: by run the places (M, 3) in the
+    world of what stands still; sizes: by scene and run a sphere's radius, or the height of an unrolled one."""
 
     def __init__(self) -> None:
         self.runs: dict[str, list[int]] = {}
         self.truths: set[str] = set()
         self.panorama = False  # the true one
-        self.standing: list[Array] = []
+        self.standing: dict[int, list[Array]] = {}
         self.sizes: dict[tuple[str, int], float] = {}
 
     def learn(self, run: Compared, chunk: Chunk) -> None:
@@ -54,7 +54,7 @@ class Scenes:
                     column = column.flatten()
                 points = column.to_numpy().reshape(-1, n)
                 if scene == schema.WORLD:
-                    self.standing.append(points)
+                    self.standing.setdefault(place, []).append(points)
                 elif not name.startswith("Points") and len(points):
                     size = float(points[:, 1].max())
                     self.sizes[scene, place] = max(self.sizes.get((scene, place), 0.0), size)
@@ -83,9 +83,9 @@ def view(scene: str, holders: list[Compared], first: Compared, scenes: Scenes, n
         return flat(origin, contents, scenes.sizes.get((scene, holders[0].place)), name)
     trails = [*(f"{one.path}{scene}/estimate/trail" for one in holders), f"{first.path}{scene}/truth/trail"]
     trail: Any = {path: [rrb.VisibleTimeRanges(_since_start())] for path in trails}
+    eye, ground = _eye(scene, holders, first, scenes, wide)
     return rrb.Spatial3DView(
-        origin=origin, contents=contents, name=name, eye_controls=_eye(scene, holders, first, scenes, wide),
-        line_grid=False,
+        origin=origin, contents=contents, name=name, eye_controls=eye, line_grid=ground,
         overrides=trail if scene == schema.WORLD else {}, **_PLAIN,
     )  # fmt: skip
 
@@ -106,29 +106,26 @@ def _since_start() -> list[rrb.VisibleTimeRange]:
     return [rrb.VisibleTimeRange(timeline, start=start, end=now) for timeline in ("step", "time", "stage")]
 
 
-def _eye(scene: str, holders: list[Compared], first: Compared, scenes: Scenes, wide: float) -> rrb.EyeControls3D:
-    """The same for all runs: the first's places decide; round a sphere as far away as it is large."""
+def _eye(
+    scene: str, holders: list[Compared], first: Compared, scenes: Scenes, wide: float
+) -> tuple[rrb.EyeControls3D, rrb.LineGrid3D | bool]:
+    """Where a scene is seen from, and its ground. The same for all runs on the first's data, whose places decide, and
+    each of another world by its own; round a sphere as far away as it is large."""
     if scene == schema.BARS:
-        count = max(len(one.run.labels) for one in holders)
-        middle = 0.5 * schema.BAR * (count - 1)
-        return rrb.EyeControls3D(
-            position=[middle, 0.45, 1.3 + 0.35 * count], look_target=[middle, 0.45, 0], eye_up=[0, 1, 0], kind="Orbital"
-        )
+        return eyes.bars(max(len(one.run.labels) for one in holders)), False
     if scene != schema.WORLD:
-        size = scenes.sizes.get((scene, holders[0].place), 1.0)
-        place = [1.6 * size, -1.9 * size, 1.1 * size]
-        return rrb.EyeControls3D(position=place, look_target=[0, 0, 0], eye_up=[0, 0, 1], kind="Orbital")
-    places = _places(first) if _position(first) else _places(holders[0])
-    points = np.concatenate([places, *scenes.standing])
+        return eyes.around(scenes.sizes.get((scene, holders[0].place), 1.0)), False
+    whose = [first if one.of_first and _position(first) else one for one in holders]
+    standing = [points for one in [*whose, *holders] for points in scenes.standing.get(one.place, [])]
+    points = np.concatenate([*map(_places, whose), *standing])
     points = points[np.isfinite(points).all(1)]
     low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.ones(3))
-    (x, y, z), reach = 0.5 * (low + high), max(0.5, float(0.5 * np.abs(high - low).max()))
+    ground = eyes.ground(0.5 * float((high - low).max()))
     if low[2] == high[2]:
-        # The eye sees about as much upwards as it is away, and `wide` times that across; a fifth is left as a margin.
-        height = 1.25 * max(1.0, (high - low)[1], (high - low)[0] / wide)
-        return rrb.EyeControls3D(position=[x, y, height], look_target=[x, y, 0], eye_up=[0, 1, 0], kind="Orbital")
-    place = [x + 1.5 * reach, y - 1.85 * reach, z + 1.25 * reach]
-    return rrb.EyeControls3D(position=place, look_target=[x, y, z], eye_up=[0, 0, 1], kind="Orbital")
+        # The eye sees about as much upwards as it is away, and `wide` times that across; a quarter is left as a margin.
+        height = 1.32 * max(1.0, (high - low)[1], (high - low)[0] / wide)
+        return eyes.above(0.5 * (low + high), height), ground
+    return eyes.aside(0.5 * (low + high), 0.5 * (high - low)), ground
 
 
 def _position(one: Compared) -> tuple[str, Space] | None:

@@ -16,6 +16,7 @@ from viz_estim.recording.batch import Batch, StageRows
 from viz_estim.recording.bodies import Bodies, sphere, tips
 from viz_estim.recording.columns import Style, Times, send_static
 from viz_estim.recording.layout import Layout, as_product, flat3, is_position, leaves, place_of
+from viz_estim.recording.readings import told
 from viz_estim.recording.standing import Standing
 
 
@@ -99,24 +100,15 @@ class Scenes:
             if self._reads_place(name):
                 style = Style(rr.Points3D, colors=[colour], radii=[-4.0])
                 path = schema.drawn(rows.name, name)
-                told = self._told(rows, rows.some(f"{field}.predicted", kept)[:, space.at[name]], kept)
-                places = flat3(mine[told, : 2 if self._layout.planar else 3])
-                self._standing.draw(rows.name, field, path, at, style, told.astype(int), positions=places)
+                assert self._layout.position
+                known = told(self._layout, rows, field, name, self._layout.position)[kept]
+                places = flat3(mine[known, : 2 if self._layout.planar else 3])
+                self._standing.draw(rows.name, field, path, at, style, known.astype(int), positions=places)
             elif own_scene(self._layout, name):
                 expected = rows.some(f"{field}.predicted", kept)[:, space.at[name]]
                 self._draw_arrows(rows.name, field, name, at, mine, expected, colour)
             else:
                 self._draw_ranges(rows, field, name, at, kept, mine, colour)
-
-    def _told(self, rows: StageRows, predicted: Array, kept: np.ndarray) -> np.ndarray:
-        """Which readings of a place are places: where a loop told the residual alone, zero stands for what was expected
-        though the estimate was elsewhere, and the residual for the reading."""
-        told = np.asarray(predicted.any(1))
-        if not told.all() and self._layout.position and not self._layout.particles:
-            prior = np.full((len(rows.stages), len(self._layout.space.names)), np.nan)
-            prior[rows.has_prior] = rows.prior("mean")
-            told |= ~prior[kept][:, self._layout.space.at[self._layout.position]].any(1)
-        return told
 
     def _draw_arrows(
         self, stage: str, field: str, name: str, at: Times, z: Array, expected: Array, colour: schema.Colour
@@ -186,6 +178,8 @@ class Scenes:
 
 def own_scene(layout: Layout, name: str) -> bool:
     """Whether a sensor's readings stand in a scene of their own: three components in the body, beside an attitude."""
+    if not layout.attitude:
+        return False
     space = layout.sensors[name]
     three = len(space.names) == 3 and isinstance(space, (Euclidean, S2))
     return three and not is_position(space)

@@ -25,6 +25,7 @@ SENSORS: dict[str, Colour] = {
 }
 BAND: Colour = (120, 120, 130)
 SCENERY: Colour = (150, 150, 160)
+OTHER_PATH: Colour = (120, 130, 185)  # apart from the truth's, which is drawn whole
 MODE: Colour = (255, 255, 150)
 AXES: tuple[Colour, ...] = ((235, 70, 70), (80, 200, 90), (80, 130, 255))  # x, y, z
 HEALTH: dict[str, Colour] = {

@@ -13,6 +13,7 @@ from viz_estim.recording import plot_tabs, schema
 from viz_estim.recording.columns import Times
 from viz_estim.recording.compared import Clock, Compared
 from viz_estim.recording.lines import Lines, Series, shown
+from viz_estim.recording.ranges import Ranges
 
 _BOUNDED = 2  # runs at most whose ±3σ are drawn: more lines than that hide each other
 _READING: schema.Colour = (150, 150, 160)
@@ -32,10 +33,11 @@ class Plot(NamedTuple):
 
 
 class Sheet:
-    """Draws lines of runs, the first of which has the clock. plots: what was drawn, by its path."""
+    """Draws lines of runs, the first of which has the clock. plots: what was drawn, by its path; ranges: its axes."""
 
     def __init__(self, stream: rr.RecordingStream, runs: list[Compared]) -> None:
-        self._lines = Lines(stream)
+        self.ranges = Ranges()
+        self._lines = Lines(stream, self.ranges)
         self.runs = runs
         self.bounded = len(runs) <= _BOUNDED
         self._clocks = [Clock(runs[0], one) for one in runs]
@@ -65,13 +67,13 @@ class Sheet:
         if np.isfinite(values).any():
             path, _ = self.plot(tab, key, row, title, top=top)
             self.plots[path].runs.add(one.place)
-            self._lines.broken(f"{path}/{one.part}", at, "", (one.name, one.colour, values))
+            self._lines.broken(f"{path}/{one.part}", at, "", (one.name, one.colour, values), path)
 
     def once(self, tab: str, key: str, what: str, name: str, at: Times, values: Array, row: str, title: str) -> None:
         """What no run has for itself, as `-truth`, beneath them."""
         if np.isfinite(values).any():
             path, _ = self.plot(tab, key, row, title)
-            self._lines.broken(f"{path}/{what}", at, "", (name, ONCE[what], values))
+            self._lines.broken(f"{path}/{what}", at, "", (name, ONCE[what], values), path)
 
     def band(self, path: str, at: Times, bounds: list[tuple[str, float]]) -> None:
         """Level lines by name, over these times."""
@@ -91,7 +93,7 @@ class Sheet:
                 path, _ = self.plot(tab, key, name, title)
                 for sign, mark in ((1, "+3σ"), (-1, "−3σ")):
                     line = (f"±3σ {one.name}", (red // 2, green // 2, blue // 2), sign * scale * bounds[:, c])
-                    self._lines.broken(f"{path}/{one.part}/{mark}", at, "", line)
+                    self._lines.broken(f"{path}/{one.part}/{mark}", at, "", line, path)
             self.line(tab, key, one, at, scale * values[:, c], name, title)
 
 

@@ -141,7 +141,7 @@ def diffdrive_ekf(
         "Speed and turn rate are integrated, the GPS corrects them at every tenth step. Between readings the ellipse "
         "grows, most of all across the way, where the heading's error goes. **No reading shows the heading**: it is "
         "learnt from where the positions lead, so in the first second or two its error is large and a reading moves "
-        "it most. The grey line that leaves the truth's is dead reckoning: the inputs alone, from the same start.\n\n"
+        "it most. The line that leaves the truth's is dead reckoning: the inputs alone, from the same start.\n\n"
         f"**This data:** {data.notes}; starts {begins}."
     )
     return Scenario(

@@ -1,0 +1,83 @@
+"""Axes: most of the values are in sight, wherever a few are; and at least two numbers stand beside a low plot."""
+
+import numpy as np
+import pytest
+
+from viz_estim.recording.ranges import Ranges, readable
+
+
+def shown(*lines: np.ndarray) -> tuple[float, float]:
+    ranges = Ranges()
+    for line in lines:
+        ranges.learn("plot", line.reshape(len(line), -1))
+    axis = ranges.axis("plot")
+    assert axis is not None
+    low, high = axis.range.as_arrow_array().to_pylist()[0]
+    return low, high
+
+
+def test_a_wide_first_band_does_not_flatten_the_rest() -> None:
+    bound = 0.4 + 15 * np.exp(-np.arange(2500) / 10)
+    low, high = shown(np.stack([-bound, bound], axis=1), 0.1 * np.sin(np.arange(2500)))
+    assert low < -0.4
+    assert 0.4 < high < low + 3
+
+
+def test_two_outliers_leave_the_frame_and_a_lasting_error_does_not() -> None:
+    values = np.sin(0.1 * np.arange(3000))
+    values[[700, 900]] = 50, -70
+    assert shown(values)[1] - shown(values)[0] < 5
+    values[2000:2200] = 30
+    assert shown(values)[1] >= 30
+
+
+@pytest.mark.parametrize("length", [1, 3, 40])
+def test_all_of_a_calm_plot_is_in_sight(length: int) -> None:
+    values = np.arange(length + 1.0)
+    low, high = shown(values)
+    assert low <= 0 < length <= high
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_at_least_two_powers_of_ten_are_named_and_at_most_half_the_plot_is_empty(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    low, high = np.sort(10 ** rng.uniform(-4, 4) * (rng.standard_normal(2)))
+    a, b = readable(low, high)
+    assert a <= low < high <= b
+    assert b - a < 2.6 * (high - low)
+    steps = 10.0 ** np.arange(-9, 9)
+    named = [step for step in steps if np.floor(b / step) - np.ceil(a / step) >= 1 and (b - a) / step < 8]
+    assert named
+
+
+def test_nothing_and_a_constant_have_no_axis_of_their_own() -> None:
+    ranges = Ranges()
+    ranges.learn("constant", np.ones((9, 1)))
+    ranges.learn("unknown", np.full((9, 1), np.nan))
+    assert ranges.axis("constant") is ranges.axis("unknown") is ranges.axis("never") is None
+
+
+def test_an_axis_is_made_anew_once_values_outgrow_it_and_memory_is_bounded() -> None:
+    ranges = Ranges()
+    ranges.learn("plot", np.sin(np.arange(700.0))[:, None])
+    assert not ranges.outgrown()  # none was asked for
+    ranges.axis("plot")
+    assert not ranges.outgrown()
+    for k in range(20):
+        ranges.learn("plot", np.full((700, 1), float(k)))
+    assert ranges.outgrown()
+    ranges.axis("plot")
+    assert not ranges.outgrown()
+    assert len(ranges._seen["plot"]._low) <= 1024
+
+
+@pytest.mark.parametrize(("scale", "above"), [(1.0, False), (500.0, True)])
+def test_values_that_are_all_above_the_level_lines_are_in_sight(scale: float, above: bool) -> None:
+    ranges, values = Ranges(), scale * np.random.default_rng(0).chisquare(3, 900)
+    ranges.learn("plot", np.full((900, 2), [0.2, 9.3]))
+    ranges.learn("plot", values[:, None])
+    ((low, high),) = ranges.upward("plot", 28.0).range.as_arrow_array().to_pylist()
+    assert low == 0
+    assert (high > 28.0) == above
+    assert np.mean(values <= high) > 0.9
+    assert ranges.upward("never", 28.0).range.as_arrow_array().to_pylist() == [[0, 28.0]]
