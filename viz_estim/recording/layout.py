@@ -28,7 +28,7 @@ KEPT = 4000  # particles of a cloud at most: more are thinned by weight
 
 class Layout:
     """space: the state's, as a product (of nothing, where the belief is over labels); inputs: the sensors on ticks;
-    duration: in s, as far as it is known so far; last: the last step, 0 where it is not known beforehand.
+    duration: in s, as far as it is known so far.
 
     stages: per stage the shape (as JSON: a list) or the space of each field; sensors: the spaces of those that
     innovations came from; reach: about how long their readings are; silent: by sensor the steps at which a reading was
@@ -46,7 +46,6 @@ class Layout:
         self.true_parts = [name for name, rows in known.items() if rows.any()]
         self.gapless = {name for name in self.true_parts if known[name].all()}
         self.duration = scenario.ticks[-1].time - scenario.ticks[0].time
-        self.last = len(scenario.ticks) - 1
         self.explained = bool(scenario.notes)
         parts = self.space.parts.items()
         self.position = next((name for name, part in parts if is_position(part) or isinstance(part, SE2)), None)

@@ -9,7 +9,7 @@ from viz_estim.core.descriptions import describe
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick
 from viz_estim.core.spaces import SO3, Euclidean, Space
-from viz_estim.recording import blueprints, schema
+from viz_estim.recording import schema
 from viz_estim.recording.batch import Batch
 from viz_estim.recording.columns import Times, drawn, send, send_static, words
 from viz_estim.recording.innovations import Innovations
@@ -39,13 +39,6 @@ class Plots:
         gated = self._innovations.add(batch)
         for sensor in self._layout.inputs:
             self._draw_health(batch, sensor, gated.get(sensor, set()))
-        self._frame(batch)
-
-    def _frame(self, batch: Batch) -> None:
-        """Sends the view anew where axes are to be others by now: at the end for certain, before it now and then."""
-        ended = batch.times.step[-1] == self._layout.last or batch.steps[-1].error
-        if self._layout.ranges.outgrown(1.0 if ended else 1.8 if self._layout.last else 1.1):
-            self._stream.send_blueprint(blueprints.build(self._layout))
 
     def _draw_states(self, batch: Batch) -> None:
         """The belief at the end of each step, by part: its components, its σ, its error."""

@@ -24,9 +24,14 @@ _EDGE = 0.03  # of the axis, beyond the last value
 
 
 class Ranges:
-    """Learns the values of plots by their paths, in bounded memory, and says which axis shows them."""
+    """Learns the values of plots by their paths, in bounded memory, and says which axis shows them.
+
+    Not `fixed` while someone watches a run: then each plot shows all, as the viewer does by itself, for axes that
+    follow what comes take a new view, with which the cursor jumps.
+    """
 
     def __init__(self) -> None:
+        self.fixed = True
         self._seen: dict[str, _Seen] = {}
         self._shown: dict[str, tuple[_Range, Callable[[], _Range | None]]] = {}  # and how it is found anew
         self._rows = self._looked = 0
@@ -54,7 +59,7 @@ class Ranges:
         return axis or rrb.ScalarAxis(range=(0.0, top))
 
     def _axis(self, path: str, find: Callable[[], _Range | None]) -> rrb.ScalarAxis | None:
-        found = find()
+        found = find() if self.fixed else None
         if found is None:
             return None
         self._shown[path] = found, find
