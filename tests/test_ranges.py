@@ -81,3 +81,24 @@ def test_values_that_are_all_above_the_level_lines_are_in_sight(scale: float, ab
     assert (high > 28.0) == above
     assert np.mean(values <= high) > 0.9
     assert ranges.upward("never", 28.0).range.as_arrow_array().to_pylist() == [[0, 28.0]]
+
+
+def test_a_high_plot_needs_no_number_that_is_far_away() -> None:
+    ranges = Ranges()
+    ranges.learn("/p", np.linspace(-360.0, 360.0, 100)[:, None])
+    asked = [ranges.axis("/p"), ranges.high("/p", 3), ranges.high("/p", 1)]
+    low, same, high = (axis.range.as_arrow_array().to_pylist()[0] for axis in asked if axis)
+    assert low == same
+    assert low[1] > 1000
+    assert 360 < high[1] < 400
+    assert ranges.high("/unknown", 1) is None
+
+
+def test_while_someone_watches_each_plot_shows_all() -> None:
+    ranges = Ranges()
+    ranges.learn("/p", np.arange(10.0)[:, None])
+    ranges.fixed = False
+    assert ranges.axis("/p") is None
+    assert not ranges.outgrown()
+    ranges.fixed = True
+    assert ranges.axis("/p") is not None

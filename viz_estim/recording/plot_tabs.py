@@ -70,7 +70,16 @@ def _whole_run() -> rrb.TimeAxis:
 
 def tabs(layout: Layout) -> list[_Item]:
     """All tabs, the one that says most first."""
-    return [show_all(tab, layout.duration) for tab in _tabs(layout)]
+    return [show_all(_high(tab, layout), layout.duration) for tab in _tabs(layout)]
+
+
+def _high(tab: _Item, layout: Layout) -> _Item:
+    """The same, where plots in few rows, which are high, have axes for it."""
+    rows = len([*tab.contents]) if isinstance(tab, rrb.Container) else 1
+    for view in _views(tab) if rows < _READABLE else []:
+        if axis := layout.ranges.high(str(view.origin), rows):
+            view.properties["ScalarAxis"] = axis
+    return tab
 
 
 def _tabs(layout: Layout) -> list[_Item]:

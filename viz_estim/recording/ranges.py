@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import rerun.blueprint as rrb
@@ -15,12 +16,21 @@ import rerun.blueprint as rrb
 from viz_estim.core.quaternions import Array
 
 _Range = tuple[float, float]
+_Find = Callable[[float], _Range | None]  # of how many steps of a power of ten are named
 _ASIDE = 0.02  # of the values at either end may be out of sight
 _CALM = 2.5  # all is shown where it is no more than this, by what most need
 _ROOM = 0.25  # of what most need, above and below it
 _KEPT = 1024  # rows of a plot, at most; more are thinned evenly
-_NUMBERS = 7.0  # steps of a power of ten that are still named on a low plot
+_NUMBERS, _ROWS = 7.0, 3  # steps of a power of ten that are still named on a low plot, one of so many rows
 _EDGE = 0.03  # of the axis, beyond the last value
+
+
+class _Shown(NamedTuple):
+    """An axis that was asked for, and how it is found anew."""
+
+    range: _Range
+    find: _Find
+    numbers: float
 
 
 class Ranges:
@@ -33,7 +43,7 @@ class Ranges:
     def __init__(self) -> None:
         self.fixed = True
         self._seen: dict[str, _Seen] = {}
-        self._shown: dict[str, tuple[_Range, Callable[[], _Range | None]]] = {}  # and how it is found anew
+        self._shown: dict[str, _Shown] = {}
         self._rows = self._looked = 0
 
     def learn(self, path: str, values: Array) -> None:
@@ -52,17 +62,21 @@ class Ranges:
         than so many times what most need."""
         return self._axis(path, partial(self._seen[path].range, calm)) if path in self._seen else None
 
+    def high(self, path: str, rows: int) -> rrb.ScalarAxis | None:
+        """The axis that was asked for of a plot, where it is one of so few rows that more numbers are named on it."""
+        return self._axis(path, self._shown[path].find, _ROWS * _NUMBERS / rows) if path in self._shown else None
+
     def upward(self, path: str, top: float) -> rrb.ScalarAxis:
         """The axis from 0 to `top` of a plot that has level lines, or as far up as its values are, where most of them
         would be out of sight."""
         axis = self._axis(path, partial(self._seen[path].upward, top)) if path in self._seen else None
         return axis or rrb.ScalarAxis(range=(0.0, top))
 
-    def _axis(self, path: str, find: Callable[[], _Range | None]) -> rrb.ScalarAxis | None:
-        found = find() if self.fixed else None
+    def _axis(self, path: str, find: _Find, numbers: float = _NUMBERS) -> rrb.ScalarAxis | None:
+        found = find(numbers) if self.fixed else None
         if found is None:
             return None
-        self._shown[path] = found, find
+        self._shown[path] = _Shown(found, find, numbers)
         return rrb.ScalarAxis(range=found)
 
     def outgrown(self, more: float = 1.0) -> bool:
@@ -71,8 +85,8 @@ class Ranges:
         if not self._shown or self._rows < more * self._looked:
             return False
         self._looked = self._rows
-        for (low, high), find in self._shown.values():
-            span, now = high - low, find()
+        for (low, high), find, numbers in self._shown.values():
+            span, now = high - low, find(numbers)
             if now and (max(low - now[0], now[1] - high) > 0.08 * span or now[1] - now[0] < 0.6 * span):
                 return True
         return False
@@ -94,24 +108,25 @@ class _Seen:
         while len(self._low) > _KEPT:
             self._low, self._high, self._stride = self._low[::2], self._high[::2], 2 * self._stride
 
-    def upward(self, top: float) -> _Range:
+    def upward(self, top: float, numbers: float) -> _Range:
         ordered = np.sort(self._high)  # with a level line each half of them is that line's
         middle, most = (float(ordered[int(share * (len(ordered) - 1))]) for share in (0.75, 0.98))
-        return (0.0, top) if middle <= top else (0.0, readable(0.0, most)[1])
+        return (0.0, top) if middle <= top else (0.0, readable(0.0, most, numbers)[1])
 
-    def range(self, calm: float) -> _Range | None:
+    def range(self, calm: float, numbers: float) -> _Range | None:
         least, most = self._all
         aside = int(_ASIDE * len(self._low))
         low, high = float(np.sort(self._low)[aside]), float(np.sort(self._high)[-1 - aside])
         core = high - low
         if most - least > calm * core > 0:
             least, most = max(least, low - _ROOM * core), min(most, high + _ROOM * core)
-        return readable(least, most) if most - least > 1e-9 * max(abs(least), abs(most)) else None
+        return readable(least, most, numbers) if most - least > 1e-9 * max(abs(least), abs(most)) else None
 
 
-def readable(low: float, high: float) -> _Range:
-    """The same range, made longer where fewer than two multiples of a power of ten would be named on it."""
-    step = 10.0 ** np.ceil(np.log10((high - low) / _NUMBERS))
+def readable(low: float, high: float, numbers: float = _NUMBERS) -> _Range:
+    """The same range, made longer where fewer than two multiples of a power of ten would be named on it; numbers: so
+    many steps of one are still named."""
+    step = 10.0 ** np.ceil(np.log10((high - low) / numbers))
     above, below = (np.floor(high / step) + 1) * step, (np.ceil(low / step) - 1) * step
     while (above - below) / step < 2.5:  # they are the next ones outside
         if above - high <= 1.5 * (low - below):  # about as far: upwards, as in the plots beside it

@@ -233,7 +233,7 @@ class Recorder:
         self._standing.clear(batch)
         self._plots.add(batch)
         self._pictures.add(batch)
-        self._show(1.5, 1.8)
+        self._show(1.5, 4.0)
         if error := steps[-1].error:  # a failure is a run's last step
             text = f"step {error.step}, stage {error.stage}: {error.message}"
             last = batch.times.pick(np.array([-1]))
