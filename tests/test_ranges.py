@@ -57,18 +57,16 @@ def test_nothing_and_a_constant_have_no_axis_of_their_own() -> None:
     assert ranges.axis("constant") is ranges.axis("unknown") is ranges.axis("never") is None
 
 
-def test_an_axis_is_made_anew_once_values_outgrow_it_and_memory_is_bounded() -> None:
+def test_memory_is_bounded_and_all_of_a_run_counts() -> None:
     ranges = Ranges()
-    ranges.learn("plot", np.sin(np.arange(700.0))[:, None])
-    assert not ranges.outgrown()  # none was asked for
-    ranges.axis("plot")
-    assert not ranges.outgrown()
     for k in range(20):
         ranges.learn("plot", np.full((700, 1), float(k)))
-    assert ranges.outgrown()
-    ranges.axis("plot")
-    assert not ranges.outgrown()
-    assert len(ranges._seen["plot"]._low) <= 1024
+        assert sum(len(values) for values in ranges._seen["plot"]._waiting) <= 4096
+    axis = ranges.axis("plot")
+    assert len(ranges._seen["plot"]._low) <= 4096
+    assert axis is not None
+    ((low, high),) = axis.range.as_arrow_array().to_pylist()
+    assert low <= 0 < 19 <= high
 
 
 @pytest.mark.parametrize(("scale", "above"), [(1.0, False), (500.0, True)])
@@ -86,19 +84,17 @@ def test_values_that_are_all_above_the_level_lines_are_in_sight(scale: float, ab
 def test_a_high_plot_needs_no_number_that_is_far_away() -> None:
     ranges = Ranges()
     ranges.learn("/p", np.linspace(-360.0, 360.0, 100)[:, None])
-    asked = [ranges.axis("/p"), ranges.high("/p", 3), ranges.high("/p", 1)]
+    asked = [ranges.axis("/p"), ranges.asked("/p", 3), ranges.asked("/p", 1)]
     low, same, high = (axis.range.as_arrow_array().to_pylist()[0] for axis in asked if axis)
     assert low == same
     assert low[1] > 1000
     assert 360 < high[1] < 400
-    assert ranges.high("/unknown", 1) is None
+    assert ranges.asked("/unknown", 1) is None
 
 
-def test_while_someone_watches_each_plot_shows_all() -> None:
-    ranges = Ranges()
+def test_as_long_as_more_is_to_come_each_plot_shows_all() -> None:
+    ranges = Ranges(fixed=False)
     ranges.learn("/p", np.arange(10.0)[:, None])
-    ranges.fixed = False
     assert ranges.axis("/p") is None
-    assert not ranges.outgrown()
     ranges.fixed = True
     assert ranges.axis("/p") is not None

@@ -63,7 +63,7 @@ class Layout:
         self.inputs: list[str] = []
         self.sensors: dict[str, Space] = {}
         self.reach: dict[str, float] = {}
-        self.ranges = Ranges()
+        self.ranges = Ranges(fixed=False)
 
     @property
     def planar(self) -> bool:

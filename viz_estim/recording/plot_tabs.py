@@ -70,14 +70,14 @@ def _whole_run() -> rrb.TimeAxis:
 
 def tabs(layout: Layout) -> list[_Item]:
     """All tabs, the one that says most first."""
-    return [show_all(_high(tab, layout), layout.duration) for tab in _tabs(layout)]
+    return [show_all(_with_axes(tab, layout), layout.duration) for tab in _tabs(layout)]
 
 
-def _high(tab: _Item, layout: Layout) -> _Item:
-    """The same, where plots in few rows, which are high, have axes for it."""
+def _with_axes(tab: _Item, layout: Layout) -> _Item:
+    """The same with the axes that were asked for, as high as the tab's rows are."""
     rows = len([*tab.contents]) if isinstance(tab, rrb.Container) else 1
-    for view in _views(tab) if rows < _READABLE else []:
-        if axis := layout.ranges.high(str(view.origin), rows):
+    for view in _views(tab):
+        if axis := layout.ranges.asked(str(view.origin), rows):
             view.properties["ScalarAxis"] = axis
     return tab
 
@@ -237,7 +237,8 @@ def _framed(
 ) -> rrb.TimeSeriesView:
     """A plot whose axis, unless it is given, shows most of its values; of some the jumps are what they have to say."""
     jumps = [10.0] * (group in ("moved", "figure"))
-    axis = axis or layout.ranges.axis(schema.plot(group, component), *jumps)
+    if axis is None:
+        layout.ranges.ask(schema.plot(group, component), *jumps)
     return graph(group, component, name, axis, legend=legend)
 
 

@@ -94,7 +94,6 @@ class Recorder:
             Clouds(self._stream, self._layout, self._standing, every, count) if self._layout.particles else None
         )
         self._plots = Plots(self._stream, self._layout)
-        self._layout.ranges.fixed = live is None
         self._pictures = Pictures(self._stream, self._layout, every)
         belief = scenario.beliefs[0]
         kind: dict[str, Any] = {"belief": type(belief).__name__, "facts": dict(scenario.facts)}
@@ -148,9 +147,8 @@ class Recorder:
             raise self._failed
         self._properties["result"] = result
         self._properties["facts"] |= facts or {}
-        self._viewed = self._viewed if self._layout.ranges.fixed else []
         self._layout.ranges.fixed = True
-        self._show(1.05, 1.0)
+        self._stream.send_blueprint(blueprints.build(self._layout))
         self._send_properties()
         self._disconnect()
         os.replace(self.partial, self.path)
@@ -233,19 +231,18 @@ class Recorder:
         self._standing.clear(batch)
         self._plots.add(batch)
         self._pictures.add(batch)
-        self._show(1.5, 4.0)
+        self._show()
         if error := steps[-1].error:  # a failure is a run's last step
             text = f"step {error.step}, stage {error.stage}: {error.message}"
             last = batch.times.pick(np.array([-1]))
             at = Times(last.step, last.time, np.array([batch.end - 1]))
             send(self._stream, schema.EVENTS, at, rr.TextLog.columns(text=[text], level=["ERROR"]))
 
-    def _show(self, outgrown: float, more: float) -> None:
-        """Sends the view, where it is built from other things than the last one, or its frame or an axis has been
-        outgrown; axes are looked at again when there are so many times more rows."""
+    def _show(self) -> None:
+        """Sends the view, where it is built from other things than the last one, or its frame has been outgrown."""
         known = [*self._layout.sensors, *self._layout.stages]
         reach = self._layout.extent[1] if self._layout.extent else 0.0
-        if known != self._viewed or reach > outgrown * self._framed or self._layout.ranges.outgrown(more):
+        if known != self._viewed or reach > 1.5 * self._framed:
             self._viewed, self._framed = known, reach
             self._stream.send_blueprint(blueprints.build(self._layout))
 
