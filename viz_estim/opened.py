@@ -5,14 +5,10 @@ from __future__ import annotations
 import atexit
 import os
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
-
-class Recording(Protocol):
-    """What is told of a person's code, and may be left open."""
-
-    def close(self) -> None: ...
-
+if TYPE_CHECKING:
+    from viz_estim.recordings import Recording
 
 _OPEN: dict[Path, Recording] = {}
 

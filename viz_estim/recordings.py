@@ -153,8 +153,8 @@ class Recording:
             raise ValueError(f"step {self._count}: a truth, but the first step had none; give that one of NaN")
         self._has_truth |= true is not None
         dt = time - self._times[-1] if self._times else 0.0
-        tick = Tick(float(time), dt, None if control is None else told.vector(control), dict(self._readings))
-        self._times.append(float(time))
+        tick = Tick(time, dt, None if control is None else told.vector(control), dict(self._readings))
+        self._times.append(time)
         self._add(Step(self._count, tick, tuple(self._stages), true, self._failure))
         self._stages, self._readings = [], {}
         self._count += 1

@@ -68,9 +68,7 @@ def modes(space: Space, states: Array, log_weights: Array, least: float = 0.05) 
     of either), a histogram smoothed with Silverman's width (1986, eq. 4.14): each cell climbs to its peak, and peaks
     without a valley between them are one mode. So are clouds that differ in heading alone.
     """
-    label, share = _apart(space, states, log_weights)
-    if int((share >= least).sum()) > 1:
-        label, share = _parted(space, states, log_weights, label, share, least)
+    label, share = _parted(space, states, log_weights, *_apart(space, states, log_weights), least)
     return _described(space, states, log_weights, label, share, least)
 
 
@@ -88,8 +86,10 @@ def _parted(
     """The modes anew, where one of several reaches past another: the kernel is as wide as they all are apart, and may
     join a few particles beside one mode to a second far off. Looked at alone, with a kernel of its own width, such a
     one falls into pieces of which one is far nearer to another mode's mean than to the rest of its own."""
-    weights, points = np.exp(log_weights), _points(space, states, log_weights)
-    found, large = label.copy(), np.flatnonzero(share >= least)
+    large = np.flatnonzero(share >= least)
+    if len(large) < 2:
+        return label, share
+    found, weights, points = label.copy(), np.exp(log_weights), _points(space, states, log_weights)
     means = {i: weights[label == i] @ points[label == i] / share[i] for i in large}
     for i in large:
         members = np.flatnonzero(label == i)

@@ -95,7 +95,7 @@ def claims(case: Case) -> Iterator[Finding]:
             continue
         moved = case.space.minus(table.mean[rows], mean[rows])[fine]
         ratio = np.max([
-            _least_ratio(table.cov[rows][fine], A @ least[fine] @ np.swapaxes(A, 1, 2))
+            ratios(table.cov[rows][fine], A @ least[fine] @ np.swapaxes(A, 1, 2))[0]
             for A in tangents(case.space, mean[rows][fine], moved)
         ], axis=0)  # fmt: skip
         shrunk = np.diagonal(before[rows][fine], axis1=1, axis2=2) / np.diagonal(least[fine], axis1=1, axis2=2)
@@ -114,11 +114,19 @@ def claims(case: Case) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def _least_ratio(A: Array, B: Array) -> Array:
-    """The smallest eigenvalue (M,) of B⁻¹·A; B positive definite."""
+def ratios(A: Array, B: Array) -> tuple[Array, Array]:
+    """The smallest and the largest eigenvalue (M,) of B⁻¹·A, symmetric matrices, B positive definite: by its Cholesky
+    factor, which no unit of a state makes less exact."""
     L = np.linalg.cholesky(symmetrised(B))
     inside = np.asarray(np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, A), 1, 2)), float)
-    return np.asarray(np.linalg.eigvalsh(symmetrised(inside))[:, 0], float)
+    values = np.asarray(np.linalg.eigvalsh(symmetrised(inside)), float)
+    return values[:, 0], values[:, -1]
+
+
+def rounding_of(before: Array, after: Array) -> Array:
+    """What rounding leaves of covariances after a stage (M,): their terms are products of d × d matrices as large as
+    those before it, some eight of them (`broken`)."""
+    return np.asarray(8 * before.shape[-1] * epsilon(after) * np.abs(before).max((1, 2)))
 
 
 _WORDS = {

@@ -15,7 +15,7 @@ import numpy as np
 
 from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.covariance import epsilon, sound
+from viz_estim.diagnosis.covariance import ratios, rounding_of, sound
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, Severity
 from viz_estim.recording.tables import StageTable
@@ -65,11 +65,11 @@ def _of(case: Case, table: StageTable) -> Iterator[Finding]:
     earlier = np.concatenate([P[:1], after[:-1]]), case.sequence.cov[np.maximum(table.place - 2, 0)]
     F, Q, after, P, right, last, past = (A[rows] for A in (F, Q, after, P, right, *earlier))
     beyond = after - right
-    rounding = 8 * P.shape[-1] * epsilon(after) * np.abs(P).max((1, 2))
-    off = np.abs(beyond).max((1, 2)) > rounding
+    off = np.abs(beyond).max((1, 2)) > rounding_of(P, after)
     if not np.median(off) or _faded(after - Q, right - Q):
         return
-    ratio = _apart(after, right)
+    low, high = ratios(after, right)
+    ratio = np.maximum(high, 1 / np.maximum(low, 1e-300))
     told = float(np.sqrt(2 / (len(P) * P.shape[-1])))
     middle = float(np.median(ratio))
     severity: Severity = "error" if middle > GROSS else "warning"
@@ -101,16 +101,6 @@ def _of(case: Case, table: StageTable) -> Iterator[Finding]:
             "as much smaller",
             "write P⁺ = F·P·Fᵀ + Q with the F and Q of this prediction and the P after the last update",
         )  # fmt: skip
-
-
-def _apart(A: Array, B: Array) -> Array:
-    """By what factor (M,) A and B differ in the direction in which they do most; inf where B⁻¹·A is not positive."""
-    L = np.linalg.cholesky(symmetrised(B))
-    half = np.linalg.solve(L, symmetrised(A))
-    inside = np.asarray(np.linalg.solve(L, np.swapaxes(half, 1, 2)), float)
-    values = np.linalg.eigvalsh(symmetrised(inside))
-    low, high = values[:, 0], values[:, -1]
-    return np.maximum(high, 1 / np.maximum(low, 1e-300))
 
 
 def _left(after: Array, made: Array, beyond: Array) -> float:

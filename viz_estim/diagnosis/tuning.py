@@ -56,11 +56,24 @@ class Tuned(NamedTuple):
         return float(np.exp(min(values.max() - values[np.searchsorted(fine, np.log(factor))], 700.0)))
 
 
+class _Turned(NamedTuple):
+    """An update's readings in M rows, each sensor's m numbers turned so that their noises are independent."""
+
+    H: Array  # (M, m, d)
+    residual: Array  # (M, m)
+    noise: Array  # (M, m), variances
+    on: np.ndarray  # (M, m), whether the reading was used and is no outlier
+    sensors: list[str]  # m
+
+
 class _Model(NamedTuple):
-    """The filter's predictions, F by name, its updates by name, and its sensors."""
+    """The filter's predictions, F and Q by name, its updates by name, and its sensors."""
 
     moves: dict[str, Array]
+    noise: dict[str, Array]
     updates: dict[str, StageTable]
+    turned: dict[str, _Turned]
+    carried: dict[str, Array]
     sensors: list[str]
 
 
@@ -80,7 +93,15 @@ def _model(case: Case) -> _Model | None:
     names = list(dict.fromkeys(n.partition("/")[0] for t in updates.values() for n in _parts(t)))
     if not all(np.nan_to_num(t.values["innovation.noise"]).any() for t in updates.values()):
         return None
-    return _Model(moves, updates, names)
+    before = {name: case.sequence.before(run.stages[name])[1] for name in (*moves, *updates)}
+    return _Model(
+        moves,
+        {name: _noise(run.stages[name], F, before[name]) for name, F in moves.items()},
+        updates,
+        {name: _turned(case, table, before[name]) for name, table in updates.items()},
+        {name: _carried(case, table) for name, table in updates.items()},
+        names,
+    )
 
 
 def _factors(case: Case) -> dict[str, Tuned]:
@@ -92,7 +113,7 @@ def _factors(case: Case) -> dict[str, Tuned]:
     scale = {kind: np.ones(B) for kind in kinds}
     for i, kind in enumerate(kinds):
         scale[kind][i * len(_GRID) : (i + 1) * len(_GRID)] = np.exp(_GRID)
-    scores = _scores(case, model.moves, model.updates, scale, B)
+    scores = _scores(case, model, scale, B)
     if scores is None:
         return {}
     found = {}
@@ -113,7 +134,7 @@ def _further(case: Case, model: _Model, found: Tuned) -> Tuned:
     """Factors on Q beyond the grid's end, as those of a Q that lacks its dt: as many again on that side."""
     grid = _GRID + (_GRID[-1] if found.factor > 1 else _GRID[0])
     scale = {name: np.ones(len(grid)) for name in model.sensors} | {"Q": np.exp(grid)}
-    scores = _scores(case, model.moves, model.updates, scale, len(grid))
+    scores = _scores(case, model, scale, len(grid))
     return found if scores is None else _best(scores, grid, float(found.scores[len(_GRID) // 2]))
 
 
@@ -125,7 +146,7 @@ def exchanged(case: Case, one: str, other: str) -> float:
     R = {name: _usual(model, name) for name in (one, other)}
     scale = {name: np.ones(2) for name in (*model.sensors, "Q")}
     scale[one][1], scale[other][1] = R[other] / R[one], R[one] / R[other]
-    scores = _scores(case, model.moves, model.updates, scale, 2)
+    scores = _scores(case, model, scale, 2)
     return -np.inf if scores is None else float(scores[1] - scores[0])
 
 
@@ -159,23 +180,18 @@ def _spline(scores: Array, grid: Array) -> tuple[Array, Array]:
     return fine, np.asarray(scipy.interpolate.CubicSpline(grid, np.nan_to_num(scores, nan=-1e300, neginf=-1e300))(fine))
 
 
-def _scores(
-    case: Case, moves: dict[str, Array], updates: dict[str, StageTable], scale: dict[str, Array], B: int
-) -> Array | None:
+def _scores(case: Case, model: _Model, scale: dict[str, Array], B: int) -> Array | None:
     """The log-likelihood (B,) of the innovations under each set of factors, B at once.
 
     An update is one number after the other, of readings turned so that their noises are independent (Bierman 1977,
     chapter II): no matrix is inverted.
     """
-    run, space = case.run, case.space
-    before = {name: case.sequence.before(run.stages[name])[1] for name in (*moves, *updates)}
-    noise = {name: _noise(run.stages[name], F, before[name]) for name, F in moves.items()}
-    turned = {name: _turned(case, table, before[name]) for name, table in updates.items()}
+    space = case.space
     noises = {
-        name: t.noise[:, :, None] * np.array([scale[sensor] for sensor in t.sensors]) for name, t in turned.items()
+        name: t.noise[:, :, None] * np.array([scale[sensor] for sensor in t.sensors])
+        for name, t in model.turned.items()
     }
     first = next((k for k, s in enumerate(case.sequence.stage) if s and s[0].step[s[1]] >= case.first), 0)
-    carried = {name: _carried(case, table) for name, table in updates.items()}
     d, score = len(space.axes), np.zeros(B)
     x, P = np.zeros((d, B)), None  # P (d, d, B)
     for stage in case.sequence.stage[first : first + _PLACES]:
@@ -183,12 +199,12 @@ def _scores(
             continue
         table, row = stage
         name = table.name
-        if name in moves and P is not None:
-            F = moves[name][row]
-            x, P = F @ x, _mapped(P, F) + noise[name][row][:, :, None] * scale["Q"]
-        elif name in updates and P is not None:
+        if name in model.moves and P is not None:
+            F = model.moves[name][row]
+            x, P = F @ x, _mapped(P, F) + model.noise[name][row][:, :, None] * scale["Q"]
+        elif name in model.updates and P is not None:
             nu, K = table.values["innovation.residual"][row], table.values["gain"][row]
-            readings = turned[name]
+            readings = model.turned[name]
             on = np.flatnonzero(readings.on[row])
             if len(on) and np.isfinite(readings.H[row]).all() and np.isfinite(nu).all():
                 v, S = np.empty((2, len(on), B))
@@ -204,21 +220,11 @@ def _scores(
                 score -= 0.5 * (v * v / S + np.log(S)).sum(0)
             x = x - (np.nan_to_num(K) @ np.nan_to_num(nu))[:, None]
             if not space.flat:
-                T = carried[name][row]
+                T = model.carried[name][row]
                 x, P = T @ x, _mapped(P, T)
         elif np.isfinite(table.cov[row]).all():
             x, P = np.zeros((d, B)), np.repeat(table.cov[row][:, :, None], B, axis=2)
     return score if P is not None and np.isfinite(score).any() else None
-
-
-class _Turned(NamedTuple):
-    """An update's readings in M rows, each sensor's m numbers turned so that their noises are independent."""
-
-    H: Array  # (M, m, d)
-    residual: Array  # (M, m)
-    noise: Array  # (M, m), variances
-    on: np.ndarray  # (M, m), whether the reading was used and is no outlier
-    sensors: list[str]  # m
 
 
 def _turned(case: Case, table: StageTable, before: Array) -> _Turned:

@@ -18,7 +18,7 @@ import numpy as np
 from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
-from viz_estim.diagnosis.covariance import epsilon, sound
+from viz_estim.diagnosis.covariance import rounding_of, sound
 from viz_estim.diagnosis.doubled import LINE, doubled
 from viz_estim.diagnosis.evidence import Case, sensor_of, tangents, tells_gain, tells_reading
 from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, Severity
@@ -234,7 +234,7 @@ def _added(told: Told, Q: Array | None, parts: list[slice]) -> _Line | None:
     if Q is None or not sound(left).all():
         return None
     rows = np.isfinite(Q).all((1, 2))
-    beyond, rounding = told.after - left, _rounding(told)
+    beyond, rounding = told.after - left, rounding_of(told.P, told.after)
     if rows.sum() < _FEWEST or np.median(np.abs(beyond[rows]).max((1, 2)) / rounding[rows]) < 1:
         return None
     _, high = _ratios(told.after, left)
@@ -252,12 +252,6 @@ def _added(told: Told, Q: Array | None, parts: list[slice]) -> _Line | None:
             "it counts once a reading and not by time", "add Q in the prediction, and not in the update",
         )  # fmt: skip
     return None
-
-
-def _rounding(told: Told) -> Array:
-    """What rounding leaves of the covariance after an update (M,): its terms are products of d × d matrices as large as
-    the covariance before it (`covariance.broken`), some eight of them."""
-    return 8 * told.P.shape[-1] * epsilon(told.after) * np.abs(told.P).max((1, 2))
 
 
 def _left(told: Told) -> Array:

@@ -54,9 +54,10 @@ def drawn(case: Case) -> Iterator[Finding]:
             before = case.sequence.past(table, row, "log_weights")
             if before is None or len(before) != len(of) or not np.isfinite(of).all():
                 continue
-            w = np.sort(np.exp(before - before.max()))
-            light = np.searchsorted(np.cumsum(w) / w.sum(), level("error", len(table.step)) / len(w))
-            copied = np.exp(before - before.max())[of.astype(int) % len(w)] < (w[light] if light < len(w) else 0.0)
+            w = np.exp(before - before.max())
+            ordered = np.sort(w)
+            light = np.searchsorted(np.cumsum(ordered) / ordered.sum(), level("error", len(table.step)) / len(w))
+            copied = w[of.astype(int) % len(w)] < (ordered[light] if light < len(w) else 0.0)
             if copied.any():
                 steps.append(int(table.step[row]))
                 rarest = min(rarest, float(1 - copied.mean()))
