@@ -114,13 +114,14 @@ class Bodies:
         self._style(path, Style(rr.Boxes3D, colors=[colour], labels=[name], show_labels=False, radii=[_LINE]))
         arrows = Style(rr.Arrows3D, colors=schema.AXES if estimated else pale, radii=[0.012 * reach * thin] * 3)
         self._style(f"{path}/axes", arrows)
-        known = np.isfinite(q).all(1)
+        known = np.asarray(np.isfinite(q).all(1))
         box: dict[str, Array] = {}
         tails: dict[str, Array] = {}
         if origins is not None:
             known &= np.isfinite(origins).all(1)
-            box["centers"], tails["origins"] = origins[known], np.repeat(origins[known], 3, axis=0)
-        q = q[known]
+            box["centers"] = _those(origins, known)
+            tails["origins"] = np.repeat(box["centers"], 3, axis=0)
+        q = _those(q, known)
         sizes = np.broadcast_to(half, (len(q), 3))
         self._send(
             path, at, drawn(rr.Boxes3D, known.astype(int), len(at), half_sizes=sizes, quaternions=xyzw(q), **box)
@@ -156,7 +157,7 @@ class Bodies:
     def _draw_ellipses(self, path: str, at: Times, drawn_ones: _Ellipsoids, colour: schema.Colour) -> None:
         self._style(path, Style(rr.Ellipsoids3D, colors=[colour], line_radii=[_LINE], fill_mode="MajorWireframe"))
         known = drawn_ones.known.astype(bool)
-        shown = drawn_ones.pick(known)
+        shown = drawn_ones if known.all() else drawn_ones.pick(known)
         columns = drawn(
             rr.Ellipsoids3D, known.astype(int), len(at), half_sizes=shown.half_sizes, quaternions=shown.quaternions,
             centers=shown.centers,
@@ -196,6 +197,11 @@ class Bodies:
 
     def _send(self, path: str, at: Times, columns: list[Column]) -> None:
         send(self._stream, path, at, columns)
+
+
+def _those(values: Array, known: np.ndarray) -> Array:
+    """The known rows; all of them are not copied."""
+    return values if known.all() else values[known]
 
 
 def axes_of(cov: Array) -> tuple[Array, Array]:

@@ -31,10 +31,13 @@ class Lines:
         """Lines in one plot, the last on top; the variance (N,) is that one's, drawn as a band. plot: its path, where
         these are some of its lines."""
         self._style(path, unit, series)
-        components = {"values": np.stack([values for _, _, values in series], axis=1)}
-        self._ranges.learn(plot or path, components["values"])
+        drawn_values = np.empty((len(at), len(series)))
+        for i, (_, _, line) in enumerate(series):
+            drawn_values[:, i] = line
+        self._ranges.learn(plot or path, drawn_values)
+        components = {"values": drawn_values}
         if variance is not None:
-            components["variances"] = np.zeros_like(components["values"])
+            components["variances"] = np.zeros_like(drawn_values)
             components["variances"][:, -1] = variance
         columns = drawn(rr.Measurements, len(series), len(at), **components)
         send(self._stream, path, at, columns)

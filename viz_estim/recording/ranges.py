@@ -38,7 +38,10 @@ class Ranges:
 
     def learn(self, path: str, values: Array) -> None:
         """Takes in lines (N, k) of a plot, which nobody may change any more; what is not finite is none."""
-        self._seen.setdefault(path, _Seen()).add(values)
+        seen = self._seen.get(path)
+        if seen is None:
+            seen = self._seen[path] = _Seen()
+        seen.add(values)
 
     def ask(self, path: str, calm: float = _CALM) -> None:
         """Asks for the axis of a plot. calm: all is shown where it is no more than so many times what most need."""
@@ -72,26 +75,33 @@ class _Seen:
         self._all = (np.inf, -np.inf)
         self._stride, self._count = 1, 0
         self._waiting: list[Array] = []  # many at once take less time
+        self._held = 0  # rows of these
 
     def add(self, values: Array) -> None:
-        self._waiting.append(values)
-        if sum(map(len, self._waiting)) > _KEPT:
+        if len(values):
+            self._waiting.append(values)
+        self._held += len(values)
+        if self._held > _KEPT:
             self._take_in()
 
     def _take_in(self) -> None:
-        waiting, self._waiting = self._waiting, []
+        waiting, self._waiting, self._held = self._waiting, [], 0
         if not waiting:
             return
-        low = np.concatenate([np.minimum.reduce(values.T) for values in waiting])
-        high = np.concatenate([np.maximum.reduce(values.T) for values in waiting])
-        known = np.isfinite(low + high)
-        if not known.all():
-            low, high = low[known], high[known]
-        if len(low):
-            self._all = min(self._all[0], float(low.min())), max(self._all[1], float(high.max()))
-        chosen = slice(-self._count % self._stride, None, self._stride)
-        self._count += len(low)
-        self._low, self._high = np.append(self._low, low[chosen]), np.append(self._high, high[chosen])
+        lows, highs = [self._low], [self._high]
+        for values in waiting:
+            least, most = float(values.min()), float(values.max())
+            if not np.isfinite(most - least):
+                values = values[np.isfinite(values).all(axis=1)]
+                if not len(values):
+                    continue
+                least, most = float(values.min()), float(values.max())
+            self._all = min(self._all[0], least), max(self._all[1], most)
+            chosen = values[-self._count % self._stride :: self._stride].T
+            self._count += len(values)
+            lows.append(np.minimum.reduce(chosen))
+            highs.append(np.maximum.reduce(chosen))
+        self._low, self._high = np.concatenate(lows), np.concatenate(highs)
         while len(self._low) > _KEPT:
             self._low, self._high, self._stride = self._low[::2], self._high[::2], 2 * self._stride
 

@@ -73,8 +73,7 @@ class Scenes:
         for name, part, where in leaves(space):
             x = points[..., where]
             if isinstance(part, SO3) and name == self._layout.attitude:
-                shades = (faint * np.array(schema.AXES)).astype(int)
-                colours = [tuple(shades[i % 3]) for i in range(3 * count)]
+                colours = [tuple(shade) for shade in (faint * np.array(schema.AXES)).astype(int)] * count
                 style = Style(rr.Points3D, colors=colours, radii=[0.014 / faint**0.5])
                 path = f"{schema.ATTITUDE}/{schema.as_part(rows.name)}/{field}"
                 self._standing.draw(rows.name, field, path, at, style, 3 * count, positions=tips(x))
