@@ -172,13 +172,13 @@ def test_the_commands_that_are_printed_can_be_pasted(cli: Cli, short: list[str],
 
 
 def test_simulated_files_calibrate_and_run(cli: Cli, tmp_path: Path) -> None:
-    folder, options = tmp_path / "sim", ["--set=duration=11", "--set=still=3", "--set=freeze=0", "--seed", "2"]
+    folder, options = tmp_path / "sim", ["--set=duration=8", "--set=still=2", "--set=freeze=0", "--seed", "2"]
     done = cli("simulate", "imu", *options, "--out", folder)
     assert (done.code, done.err) == (0, "")
     files = [Path(line) for line in done.out.splitlines()]
     assert sorted(folder.iterdir()) == sorted(files)
     ((imu, truth),) = imu_files.find_sets([folder])
-    assert len(imu_files.load(imu, truth).truth) > 1000
+    assert len(imu_files.load(imu, truth).truth) > 700
     before = imu.read_bytes()
     again = cli("simulate", "imu", *options, "--out", folder)
     assert (again.code, again.out, again.err.count("\n")) == (2, "", 1)

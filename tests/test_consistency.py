@@ -20,7 +20,7 @@ from viz_estim.core.stages import Innovation, UnscentedUpdate, Update
 from viz_estim.core.unscented import UnscentedFilter
 from viz_estim.scenarios import imu
 
-SEEDS, STEPS, WARM = 50, 1000, 100  # WARM: the first second
+SEEDS, STEPS, WARM = 50, 700, 100  # WARM: the first second
 
 
 def test_squared_distance_and_rms_are_their_formulas() -> None:

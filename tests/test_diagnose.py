@@ -36,7 +36,8 @@ SEEDS = 20
 HEALTHY: dict[str, Callable[[np.random.Generator], Scenario]] = {
     "landmarks-ekf": lambda rng: landmarks.landmarks_ekf(landmarks.landmarks(None, rng, duration=14.0)),
     "diffdrive-ekf": lambda rng: diffdrive.diffdrive_ekf(diffdrive.diffdrive(None, rng, duration=5.0)),
-    "range-ekf": lambda rng: plaza.range_ekf(plaza.plaza(None, rng, duration=50.0)),
+    # One way and one order of the beacons for all, so that they can be done side by side: what they read is drawn anew.
+    "range-ekf": lambda _: plaza.range_ekf(plaza.plaza(None, np.random.default_rng(0), duration=50.0)),
     "quadrotor-ukf-pose": lambda rng: quadrotor.quadrotor_ukf_pose(quadrotor.quadrotor(None, rng, duration=1.5)),
     "quadrotor-ukf-velocity": lambda rng: quadrotor.quadrotor_ukf_velocity(
         quadrotor.quadrotor(None, rng, duration=1.5)
@@ -126,28 +127,33 @@ def test_an_approximate_scenario_raises_only_the_codes_that_it_states(name: str)
     assert {finding.code for finding in found} <= APPROXIMATE[name], found
 
 
-@pytest.mark.parametrize(
-    ("number", "scenario", "interval"),
-    [(1, "imu-ukf", (8.57, 9.83)), (2, "imu-ukf", (8.55, 10.07)), (3, "imu-gyro", None)],
-)
-def test_the_gyro_s_freeze_is_found_in_the_real_sets(
-    number: int, scenario: str, interval: tuple[float, float] | None, real_data: Path, cli: Cli, tmp_path: Path
-) -> None:
+@pytest.mark.long
+def test_the_gyro_s_freeze_is_found_in_the_real_sets(real_data: Path) -> None:
+    """In both side by side, as long as the shorter one is; what the loader has found of it is not told."""
+    sets = [imu.imu([real_data / "ese650" / f"imuRaw{i}.mat"], np.random.default_rng(0)) for i in (1, 2)]
+    scenarios = [imu.imu_ukf(one, initial="truth") for one in sets]
+    count = min(len(scenario.ticks) for scenario in scenarios)
+    cut = [
+        replace(one, ticks=[replace(tick, faults={}) for tick in one.ticks[:count]], truth=one.truth[:count])
+        for one in scenarios
+        if one.truth is not None
+    ]
+    for recorded, interval in zip(together(cut, (0, 0)), [(8.57, 9.83), (8.55, 10.07)], strict=True):
+        first, *others = diagnose(recorded)
+        assert (first.code, first.sensor) == ("sensor_frozen", "gyro")
+        times = [float(recorded.time[recorded.row(step=step)]) for step in first.steps]
+        assert times == pytest.approx(interval, abs=0.1)
+        assert "sensor_frozen" not in {finding.code for finding in others}
+
+
+def test_no_freeze_is_found_in_the_real_set_that_has_none(real_data: Path, cli: Cli, tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
-    file = real_data / "ese650" / f"imuRaw{number}.mat"
-    assert cli("run", scenario, "--data", file, "--set", "initial=truth", "--out", path).code == 0
+    file = real_data / "ese650" / "imuRaw3.mat"
+    assert cli("run", "imu-gyro", "--data", file, "--set", "initial=truth", "--out", path).code == 0
     done = cli("diagnose", path, "--json")
     findings = json.loads(done.out)["findings"]
     assert done.code == int(any(finding["severity"] == "error" for finding in findings))
-    stuck = [finding for finding in findings if finding["code"] == "sensor_frozen"]
-    if interval is None:
-        assert stuck == []
-        return
-    assert findings[0] == stuck[0]
-    recorded = load(path)
-    times = [float(recorded.time[recorded.row(step=step)]) for step in stuck[0]["steps"]]
-    assert times == pytest.approx(interval, abs=0.1)
-    assert stuck[0]["sensor"] == "gyro"
+    assert "sensor_frozen" not in {finding["code"] for finding in findings}
 
 
 def test_a_file_and_the_steps_in_memory_are_diagnosed_alike(cli: Cli, tmp_path: Path) -> None:

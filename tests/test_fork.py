@@ -24,9 +24,9 @@ from viz_estim.scenarios import SCENARIOS
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory, cli: Cli) -> Path:
-    """A run of some 310 steps, in which the gyro freezes: many of these tests run it several times."""
+    """A run of some 250 steps, in which the gyro freezes: many of these tests run it several times."""
     path = tmp_path_factory.mktemp("fork") / "short.rrd"
-    settings = [f"--set=data.{one}" for one in ("duration=3", "still=1", "freeze=0.5")]
+    settings = [f"--set=data.{one}" for one in ("duration=2.4", "still=0.4", "freeze=0.5")]
     assert cli("run", "imu-ukf", *settings, "--seed", 3, "--out", path).code == 0
     return path
 

@@ -43,7 +43,7 @@ def drive(rng: np.random.Generator) -> Scenario:
     time, unknown = 0.1 * np.arange(61), np.full((61, 3), np.nan)
     positions = np.where(np.arange(61)[:, None] % 2 == 1, 0.0, np.nan) * np.ones(2)
     data = Drive(time, np.tile([1.5, 2.0], (61, 1)), positions, unknown, 0.3, ())
-    return drawn(se2.se2_pf(data, particles=500), rng, lambda x: {"gps": x[:2] + 0.1 * rng.standard_normal(2)})
+    return drawn(se2.se2_pf(data, particles=350), rng, lambda x: {"gps": x[:2] + 0.1 * rng.standard_normal(2)})
 
 
 def to_beacons(rng: np.random.Generator) -> Scenario:
@@ -55,7 +55,7 @@ def to_beacons(rng: np.random.Generator) -> Scenario:
             for i, place in enumerate(beacons.BEACONS)
         }
 
-    return drawn(beacons.beacons_pf(beacons.beacons(None, rng), particles=1500), rng, read)
+    return drawn(beacons.beacons_pf(beacons.beacons(None, rng), particles=1000), rng, read)
 
 
 def registration(rng: np.random.Generator) -> Scenario:

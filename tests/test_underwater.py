@@ -166,7 +166,7 @@ def test_the_simulation_draws_from_the_model() -> None:
 
 
 def test_the_beliefs_are_calibrated_and_no_other_priors_or_rates_do_better() -> None:
-    data = simulated(7, steps=3000)
+    data = simulated(7, steps=1500)
 
     def loss(**settings: float) -> float:
         return categorical_metrics(at_ends(underwater_bayes(data, **settings)), data.truth[:, None])["log_loss_nats"]

@@ -62,7 +62,8 @@ class _Turned(NamedTuple):
     H: Array  # (M, m, d)
     residual: Array  # (M, m)
     noise: Array  # (M, m), variances
-    on: np.ndarray  # (M, m), whether the reading was used and is no outlier
+    on: list[list[int]]  # M, those of a row that were used and are no outliers
+    moved: Array  # (M, d), by how much the filter moved its estimate
     sensors: list[str]  # m
 
 
@@ -201,24 +202,29 @@ def _scores(case: Case, model: _Model, scale: dict[str, Array], B: int) -> Array
         name = table.name
         if name in model.moves and P is not None:
             F = model.moves[name][row]
-            x, P = F @ x, _mapped(P, F) + model.noise[name][row][:, :, None] * scale["Q"]
+            x, P = F @ x, _mapped(P, F)
+            P += model.noise[name][row][:, :, None] * scale["Q"]
         elif name in model.updates and P is not None:
-            nu, K = table.values["innovation.residual"][row], table.values["gain"][row]
             readings = model.turned[name]
-            on = np.flatnonzero(readings.on[row])
-            if len(on) and np.isfinite(readings.H[row]).all() and np.isfinite(nu).all():
+            if on := readings.on[row]:
                 v, S = np.empty((2, len(on), B))
+                H, residual, noise = readings.H[row], readings.residual[row].tolist(), noises[name][row]
                 x, P = x.copy(), P.copy()
+                by_rows = P.reshape(d, d * B)
                 for k, i in enumerate(on):
-                    h = readings.H[row, i]
-                    C = (h @ P.reshape(d, d * B)).reshape(d, B)
-                    S[k] = h @ C + noises[name][row, i]
-                    v[k] = readings.residual[row, i] - h @ x
+                    C = (H[i] @ by_rows).reshape(d, B)
+                    S[k] = H[i] @ C
+                    S[k] += noise[i]
+                    v[k] = residual[i] - H[i] @ x
                     gain = C / S[k]
-                    x += gain * v[k]
                     P -= gain[:, None] * C
-                score -= 0.5 * (v * v / S + np.log(S)).sum(0)
-            x = x - (np.nan_to_num(K) @ np.nan_to_num(nu))[:, None]
+                    gain *= v[k]
+                    x += gain
+                v *= v
+                v /= S
+                v += np.log(S)
+                score -= 0.5 * v.sum(0)
+            x = x - readings.moved[row][:, None]
             if not space.flat:
                 T = model.carried[name][row]
                 x, P = T @ x, _mapped(P, T)
@@ -243,7 +249,10 @@ def _turned(case: Case, table: StageTable, before: Array) -> _Turned:
         # As with a gate: an outlier that moved the estimate would make what comes after it a matter of Q.
         known = np.isin(table.step, steps.get(sensor, ()))
         on[:, axes] = (get["innovation.offered"][:, i] * get["innovation.used"][:, i] * known > 0)[:, None]
-    return _Turned(H, residual, noise, on, sensors)
+    nu = get["innovation.residual"]
+    moved = (np.nan_to_num(get["gain"]) @ np.nan_to_num(nu)[:, :, None])[:, :, 0]
+    on[~np.asarray(np.isfinite(H).all((1, 2)) & np.isfinite(nu).all(1))] = False
+    return _Turned(H, residual, noise, [np.flatnonzero(row).tolist() for row in on], moved, sensors)
 
 
 def _mapped(P: Array, A: Array) -> Array:

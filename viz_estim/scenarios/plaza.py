@@ -152,7 +152,9 @@ class RangeModel:
             G = np.zeros((*x.shape, 2))
             G[..., 0, 0], G[..., 1, 0], G[..., 2, 1] = np.cos(along), np.sin(along), 1.0
             G[..., 0, 1], G[..., 1, 1] = -0.5 * distance * np.sin(along), 0.5 * distance * np.cos(along)
-            return (G * [distance_noise**2 * abs(distance), turn_noise**2 * tick.dt]) @ np.swapaxes(G, -1, -2)
+            variance = np.empty((*np.shape(distance), 1, 2))
+            variance[..., 0, 0], variance[..., 0, 1] = distance_noise**2 * np.abs(distance), turn_noise**2 * tick.dt
+            return (G * variance) @ np.swapaxes(G, -1, -2)
 
         sensors = {f"range/{label}": self._sensor(i, range_noise, gate) for i, label in enumerate(self.labels)}
         return KalmanFilter(_process, _process_jacobian, process_noise, sensors)
@@ -192,10 +194,10 @@ def _process_jacobian(x: Array, tick: Tick) -> Array:
     return F
 
 
-def _driven(x: Array, tick: Tick) -> tuple[float, Array]:
+def _driven(x: Array, tick: Tick) -> tuple[Array, Array]:
     """How far the tick's odometry went, and in which direction from states (*, n)."""
     assert tick.control is not None
-    return float(tick.control[0]), x[..., 2] + 0.5 * tick.control[1]
+    return tick.control[..., 0], x[..., 2] + 0.5 * tick.control[..., 1]
 
 
 def _starts(
