@@ -1,5 +1,6 @@
 """What a newcomer stumbles over: files that are none, runs cut short at once, numbers that are none."""
 
+import contextlib
 import io
 import runpy
 import sys
@@ -45,6 +46,17 @@ def test_a_run_cut_off_before_its_first_stages_says_so(told: Path, tmp_path: Pat
         done = cli(*command, cut)
         assert (done.code, done.out) == (2, "")
         assert f"{cut}: the run was cut off before its first steps were written" in done.err
+
+
+@pytest.mark.parametrize(("stages", "where"), [([], "before its first stage"), (["predict"], "after predict")])
+def test_where_a_run_failed_is_told_in_words(stages: list[str], where: str, tmp_path: Path, cli: Cli) -> None:
+    with contextlib.suppress(ZeroDivisionError), viz_estim.record(tmp_path / "a.rrd", ["x"]) as rec:
+        for k in range(3):
+            for stage in ["predict"] if k < 2 else stages:
+                rec.stage(stage, mean=[0.0], cov=[[1.0]])
+            rec.step(time=-1 / (k - 2))
+    for command in ("show", "diagnose"):
+        assert f"step 2, {where}: ZeroDivisionError" in cli(command, tmp_path / "a.rrd").out
 
 
 def _has_steps_alone(content: bytes, path: Path) -> bool:
