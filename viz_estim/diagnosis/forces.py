@@ -112,8 +112,8 @@ def forces(case: Case) -> Iterator[Finding]:
             "process_model", "error", None, steps, evidence,
             "the velocity is predicted by the body's turn rates in place of its specific force: gyro and accelerometer "
             f"are exchanged (this explains {explained:.0%} of the difference)",
-            "check the order of the control's numbers: which three are the gyro's (rad/s), and which the "
-            "accelerometer's (m/s², about 9.81 long)",
+            "check the order of the six numbers: which three are the gyro's (rad/s), and which the accelerometer's "
+            "(m/s², about 9.81 long)",
         )  # fmt: skip
         return
     words = f"as {what}" if what.startswith("axes") else f"by a factor ({what})"
