@@ -3,6 +3,7 @@
 import contextlib
 import io
 import runpy
+import subprocess
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -148,3 +149,23 @@ def test_the_package_is_a_program(monkeypatch: pytest.MonkeyPatch, capsys: pytes
         runpy.run_module("viz_estim", run_name="__main__")
     assert ended.value.code == 2
     assert "nowhere.rrd: no such recording" in capsys.readouterr().err
+
+
+PRESSED = """
+import signal, sys
+class Pressed:
+    def find_spec(self, name, *rest):
+        if name == "numpy":
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Pressed())
+sys.argv = ["viz-estim", "list"]
+"""
+
+
+@pytest.mark.parametrize(
+    "how",
+    ["import viz_estim.__main__ as m; m.entry()", "import runpy; runpy.run_module('viz_estim', run_name='__main__')"],
+)
+def test_ctrl_c_while_modules_are_read_is_as_quiet_as_later(how: str) -> None:
+    done = subprocess.run([sys.executable, "-c", PRESSED + how], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "viz-estim: interrupted\n")
