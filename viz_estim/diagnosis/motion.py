@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from viz_estim.core.quaternions import Array
-from viz_estim.core.spaces import SO2, SO3, wrap
-from viz_estim.diagnosis import clouds, forces
+from viz_estim.core.spaces import SO2, SO3, Euclidean, wrap
+from viz_estim.diagnosis import clouds, directions, forces
 from viz_estim.diagnosis.against import FEWEST
 from viz_estim.diagnosis.against import slip as bound
 from viz_estim.diagnosis.axes import maps
@@ -78,6 +78,7 @@ def prediction(case: Case) -> Iterator[Finding]:
             axis, unit = case.space.axes[i].rpartition(".")[2], case.space.axis_units[i]
             label = name if axis in ("", name, "angle") else f"{name} {axis}"
             told_of += _moves_as(label, unit, of, w[near], told[near], dt[near], slip[near], 2 * d, by.times)
+    headings = [case.space.at[name] for name, part in case.space.parts.items() if isinstance(part, SO2)]
     for name, part in case.space.parts.items():
         axes = range(case.space.axes_at[name].start, case.space.axes_at[name].stop)
         if isinstance(part, SO3) and all(i in moving and len(moving[i][0]) == len(moving[axes[0]][0]) for i in axes):
@@ -85,6 +86,21 @@ def prediction(case: Case) -> Iterator[Finding]:
             if (found := _turns_as(name, truly, told, moving[axes[0]][2])) is not None:
                 yield found
                 return
+        if isinstance(part, Euclidean) and len(set(part.axis_units)) == 1 and 2 <= len(axes) <= 3 and all(
+            i in moving and np.array_equal(moving[i][2], moving[axes[0]][2]) for i in axes
+        ):  # fmt: skip
+            truly, told = (np.stack([moving[i][k] for i in axes], axis=-1) for k in (0, 1))
+            of = moving[axes[0]][2]
+            heading = run.truth[np.searchsorted(run.step, of) - 1, headings[0]][:, 0] if len(headings) == 1 else None
+            heading = heading if heading is not None and np.isfinite(heading).all() else None
+            if (found := directions.turned(name, truly, told, heading, of)) is not None:
+                yield found
+                return
+            own = {name if axis in ("", name) else f"{name} {axis}" for axis in part.axes}
+            told_of = [
+                (share, directions.of_all(f, name, truly, told) if f.evidence["component"] in own else f)
+                for share, f in told_of
+            ]
     yield from _best(told_of) if told_of else map(_by_estimate, _elsewhere(case))
 
 
