@@ -23,7 +23,7 @@ _LANE, _LANES_HEAD = 40, 48  # pixels of a lane with its name, and of what stand
 # What the single numbers of our own stages mean, those first that say most.
 _OF_CLOUDS = {
     "evidence": "log-evidence of the reading",
-    "ess": "effective sample size",
+    "ess": "effective sample size before resampling",
     "distinct": "distinct ancestors",
 }
 _OF_FITS = {"rmse": "RMSE of the matches [m]", "count": "matches", "converged": "1 when the matches repeat"}
@@ -37,6 +37,14 @@ def figure_names(fields: list[str], *, fit: bool, particles: int | None) -> dict
     known = _OF_FITS if fit else {} if particles is None else _OF_CLOUDS
     fields = sorted(fields, key=lambda field: list(known).index(field) if field in known else len(known))
     return {f: known.get(f, f) + (f", of {particles}" if particles and f in _COUNTED else "") for f in fields}
+
+
+def figures_once(stages: dict[str, list[str]]) -> dict[str, list[str]]:
+    """By stage the single numbers to show: of a resampling not the effective sample size that it found, where the
+    weighing before it has told the same."""
+    weighed = any("ess" in fields and "distinct" not in fields for fields in stages.values())
+    twice = {"ess"} if weighed else set[str]()
+    return {s: [f for f in fields if not (f in twice and "distinct" in fields)] for s, fields in stages.items()}
 
 
 def lanes(origin: str, name: str) -> rrb.StateTimelineView:
@@ -149,8 +157,8 @@ def _health(layout: Layout) -> list[_Item]:
 def _figures(layout: Layout) -> list[_Item]:
     """The single numbers of stages, over time: one below the other, so that their times are."""
     views: list[_Item] = []
-    for stage, fields in layout.stages.items():
-        numbers = [field for field, what in fields.items() if what.get("shape") == []]
+    by_stage = {s: [f for f, what in fs.items() if what.get("shape") == []] for s, fs in layout.stages.items()}
+    for stage, numbers in figures_once(by_stage).items():
         named = figure_names(numbers, fit=layout.matched, particles=layout.particles or None)
         for field, words in named.items():
             top = _TOPS.get(field) if layout.matched else layout.particles if field in _COUNTED else None
