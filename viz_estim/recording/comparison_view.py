@@ -17,7 +17,7 @@ from viz_estim.recording.sheet import Plot
 
 _Item = rrb.Container | rrb.View
 _SHORT = 0.4  # of the whole: where all runs are in less of it, plots show that part
-_FEW = 3  # runs up to which a plot has room for their legend
+_FEW, _MORE = 3, 4  # runs up to which a plot has room for their legend; and one that has a row for itself
 _NAMES = {"attitude": "attitude", "world": "world [m]", "bars": "probabilities", "canvas": "mosaic [deg]"}
 _TABS = {
     "difference": "Difference", "belief": "Belief", "error": "Errors", "state": "State", "sigma": "σ",
@@ -83,8 +83,8 @@ def _scenes(runs: list[Compared], scenes: Scenes) -> list[_Item]:
 def _tabs(title: str, plots: list[Plot], ranges: Ranges, runs: int, *, named: bool) -> list[_Item]:
     """Plots in rows, those of one part of the state together; in as many tabs as keep them readable.
 
-    A legend where a plot has a run that none before it on the tab has; of many runs where that plot has a row for
-    itself, or where no scene above names them.
+    A legend where a plot has a run that none before it on the tab has; of more runs where that plot has a row for
+    itself. Of those that are too many for that, which would be cut off, only where no scene above names them.
     """
     rows: list[list[Plot]] = []
     for _, members in groupby(plots, key=lambda plot: plot.row):
@@ -101,10 +101,11 @@ def _tabs(title: str, plots: list[Plot], ranges: Ranges, runs: int, *, named: bo
         shown: set[int] = set()
         lines = []
         for row in rows[i : i + size]:
+            roomy = runs <= _FEW or (len(row) == 1 and runs <= _MORE)
             line = []
             for plot in row:
                 new = not plot.runs <= shown
-                line.append(_plot(plot, ranges, legend=new and (runs <= _FEW or len(row) == 1 or not named)))
+                line.append(_plot(plot, ranges, legend=new and (roomy or not named)))
                 shown |= plot.runs
             lines.append(rrb.Horizontal(*line))
         found.append(rrb.Vertical(*lines, name=f"{title} {len(found) + 1}" if found else title))
