@@ -82,7 +82,8 @@ def test_a_pose_has_its_sigma_in_two_plots_of_a_unit_each() -> None:
 @pytest.mark.parametrize(
     ("name", "axis", "title"),
     [("accel", "x", "accel x"), ("heading", "angle", "heading"), ("range/1", "range", "range/1"), ("y", "y", "y"),
-     ("state", "vx", "vx"), ("range", "range0", "range0"), ("range", "rangefinder", "range rangefinder")],
+     ("state", "vx", "vx"), ("range", "range0", "range0"), ("range", "rangefinder", "range rangefinder"),
+     ("pose", "attitude.roll.angle", "pose attitude.roll")],
 )  # fmt: skip
 def test_a_title_says_nothing_twice(name: str, axis: str, title: str) -> None:
     assert plot_tabs.titled(name, axis) == title

@@ -166,7 +166,11 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         gain, explained = 0.5 * (own - best), 1 - best / max(own, 1e-300)
         nothing = float(np.einsum("ti,tij,tj->", z, precision, z))
         sure = gain > -np.log(level("error", 60 * len(case.sensors)))
-        if sure and explains(what, own, best, nothing, z.size) and _singled_out(z, predicted, precision, what, unit):
+        if (
+            sure
+            and explains(what, own, best, nothing, z.size)
+            and _singled_out(z, predicted, np.asarray(precision, float), what, unit)
+        ):
             yield finding_of(name, readings.steps, what, explained, gain)
 
 

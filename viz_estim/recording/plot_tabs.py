@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import rerun.blueprint as rrb
 from rerun.encodings import TimeRange
@@ -118,20 +118,10 @@ def probabilities() -> rrb.TimeSeriesView:
 def _health(layout: Layout) -> list[_Item]:
     """Is the filter right, and does it know: errors, innovations, NIS; the innovations in a tab of their own where one
     would be crowded, and NIS with them where the errors alone crowd one."""
-    parts = [(name, part) for name, part in layout.space.parts.items() if name in layout.true_parts]
-    views: list[_Item] = [
-        _framed(layout, "error", f"{name}.{axis}", f"{titled(name, axis)} error{unit_of(part, i)}")
-        for name, part in parts
-        for i, axis in enumerate(part.axes)
-    ]
-    errors = _rows(views, [len(part.axes) for _, part in parts], most=3)
+    parts = {name: part for name, part in layout.space.parts.items() if name in layout.true_parts}
+    errors = _each(layout, "error", parts, " error", most=3)
     what = " innov." if len(layout.sensors) < 4 else ""  # four in a row leave no place for the word
-    views = [
-        _framed(layout, "innovation", f"{name}.{axis}", f"{titled(name, axis)}{what}{unit_of(space, i)}")
-        for name, space in layout.sensors.items()
-        for i, axis in enumerate(space.axes)
-    ]
-    innovations = _rows(views, [len(space.axes) for space in layout.sensors.values()])
+    innovations = _each(layout, "innovation", layout.sensors, what)
     bands: list[_Item] = []
     for name, space in layout.sensors.items():
         dof = len(space.axes)
@@ -143,6 +133,7 @@ def _health(layout: Layout) -> list[_Item]:
     if len(errors) + len(innovations) + len(nis) <= _READABLE:
         rows = [*errors, *innovations, *nis]
         return [rrb.Vertical(*rows, name=whole + bounds)] if rows else []
+    innovations = _each(layout, "innovation", layout.sensors, "")  # the tab says what they are
     if errors and len(errors) + len(nis) <= _READABLE:
         return [
             rrb.Vertical(*errors, *nis, name=whole + bounds),
@@ -150,8 +141,18 @@ def _health(layout: Layout) -> list[_Item]:
         ]
     return [
         *_in_tabs([*innovations, *nis], "Innovations" + bounds, "Innovations"),
-        *_in_tabs(errors, "Errors" + bounds, "Errors"),
+        *_in_tabs(_each(layout, "error", parts, "", most=3), "Errors" + bounds, "Errors"),
     ]
+
+
+def _each(layout: Layout, group: str, parts: Mapping[str, Space], what: str, most: int = 4) -> list[_Item]:
+    """Rows of a plot for each axis; what: the word for what is shown of it."""
+    views: list[_Item] = [
+        _framed(layout, group, f"{name}.{axis}", f"{titled(name, axis)}{what}{unit_of(part, i)}")
+        for name, part in parts.items()
+        for i, axis in enumerate(part.axes)
+    ]
+    return _rows(views, [len(part.axes) for part in parts.values()], most)
 
 
 def _figures(layout: Layout) -> list[_Item]:
@@ -279,6 +280,7 @@ def titled(name: str, axis: str) -> str:
     or where it is `state`, as what has no parts is called."""
     if axis in (name.partition("/")[0], "angle"):
         return name
+    axis = axis.removesuffix(".angle")
     return axis if name == "state" or re.fullmatch(rf"{re.escape(name)}\d+", axis) else f"{name} {axis}"
 
 
