@@ -12,6 +12,7 @@ from viz_estim.core.spaces import SO2, SO3, Euclidean, Product
 from viz_estim.diagnose import diagnose
 from viz_estim.diagnosis.directions import NOT_TURNED, TURNED_BACK
 from viz_estim.diagnosis.finding import Finding
+from viz_estim.diagnosis.geometry import singled_out
 
 DT, STEPS = 0.05, 80
 
@@ -98,3 +99,14 @@ def test_a_specific_force_that_is_not_turned_is_no_unit(times: int, what: str, t
     told = spatial(tmp_path / "a.rrd", times)
     assert told[0].evidence["map"] == what
     assert not any("for m/s" in f.cause for f in told)
+
+
+def test_a_unit_is_named_by_innovations_only_where_no_other_would_do() -> None:
+    """Readings in km/h of what was expected, against an estimate that has gone elsewhere and is as large as that."""
+    rng, n = np.random.default_rng(3), 200
+    expected, one = np.cumsum(rng.standard_normal((n, 2)), axis=0), np.broadcast_to(np.eye(2), (n, 2, 2))
+    noise = 0.1 * rng.standard_normal((n, 2))
+    assert singled_out(3.6 * expected + noise, expected, one, "km/h for m/s", "m/s")
+    assert not singled_out(3.6 * expected + noise, expected, one, "feet for m", "m/s")
+    astray = 3.6 * expected + 3.6 * np.cumsum(rng.standard_normal((n, 2)), axis=0)
+    assert not singled_out(astray, expected, one, "km/h for m/s", "m/s")

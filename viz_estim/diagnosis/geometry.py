@@ -11,7 +11,7 @@ from viz_estim.core.spaces import SO2, SO3, Euclidean, Product, Space, wrap
 from viz_estim.diagnosis.axes import explains, finding_of, maps, units
 from viz_estim.diagnosis.covariance import epsilon
 from viz_estim.diagnosis.evidence import Case, Readings, tells_reading
-from viz_estim.diagnosis.finding import HALF_THE_DIGITS, SHEET, Finding, level
+from viz_estim.diagnosis.finding import GROSS, HALF_THE_DIGITS, SHEET, Finding, level
 from viz_estim.diagnosis.fits import slope
 from viz_estim.diagnosis.kinematics import imu_axes, scale
 from viz_estim.recording.layout import leaves
@@ -169,16 +169,18 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         if (
             sure
             and explains(what, own, best, nothing, z.size)
-            and _singled_out(z, predicted, np.asarray(precision, float), what, unit)
+            and singled_out(z, predicted, np.asarray(precision, float), what, unit)
         ):
             yield finding_of(name, readings.steps, what, explained, gain)
 
 
-def _singled_out(z: Array, predicted: Array, precision: Array, what: str, unit: str) -> bool:
+def singled_out(z: Array, predicted: Array, precision: Array, what: str, unit: str) -> bool:
     """Whether of all factors known, and none, the map alone brings what was expected (M, m) to the readings (M, m). The
     factor lies between the slope of the one on the other and that of the other on the one, each with its error. Of an
     estimate that has gone elsewhere, that is far: then readings tell nothing of their unit."""
     M = dict(maps(z.shape[1], unit))[what]
+    if not (np.linalg.eigvalsh(precision)[:, 0] > 0).all():
+        return False
     L = np.linalg.cholesky(precision)
     y, x = (np.einsum("tji,tj->ti", L, v).ravel() for v in (z, predicted @ np.linalg.inv(M).T))
     forth, back = slope(y, x), slope(x, y)
@@ -188,4 +190,5 @@ def _singled_out(z: Array, predicted: Array, precision: Array, what: str, unit: 
     wide = _FAR * max(forth.error / forth.value, back.error / back.value) + SHEET
     scale = 1.0 if what.startswith("axes") else units(unit)[what]
     others = [0.0 if what.startswith("axes") else np.log(scale), *(np.log(scale / f) for f in units(unit).values())]
-    return bool(low - wide < 0 < high + wide and not any(low < off < high for off in others if abs(off) > SHEET))
+    known = wide < np.log(GROSS) and low - wide < 0 < high + wide
+    return bool(known and not any(low - wide < off < high + wide for off in others if abs(off) > SHEET))
