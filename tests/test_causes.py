@@ -93,6 +93,31 @@ def test_the_cause_is_the_first_finding_and_the_only_error(name: str) -> None:
     assert all("mend " in f.remedy for f in others if f.code in ("overconfident", "coloured_innovation", "diverged"))
 
 
+def short() -> Scenario:
+    """The first 4 s."""
+    scenario = drive()
+    assert scenario.truth is not None
+    return replace(scenario, ticks=scenario.ticks[:400], truth=scenario.truth[:400])
+
+
+def test_a_wrong_sign_is_to_be_changed_and_not_divided_by() -> None:
+    for change in (reads(lambda z: -z), steers(lambda u: u * [1, -1])):
+        first = found(change(short()))[0]
+        assert "change" in first.remedy
+        assert "divide" not in first.remedy
+    assert "divide the readings of gps by -1.2" in found(reads(lambda z: -1.2 * z)(short()))[0].remedy
+
+
+@pytest.mark.parametrize("change", [steers(lambda u: u * [1, -1]), steers(lambda u: u + np.array([0, 0.3]))])
+def test_a_motion_is_not_laid_to_a_control_that_is_not_recorded(change: Change) -> None:
+    scenario = change(short())
+    recorded = collect(scenario, run(scenario))
+    del recorded.inputs["control"]
+    first = diagnose(recorded)[0]
+    assert first.code == "process_model"
+    assert "the control" not in first.cause + first.remedy
+
+
 def test_numbers_that_are_told_are_true() -> None:
     lag = found(flawed_data.shifted(drive(), 5))[0]
     assert lag.evidence["lag_s"] == pytest.approx(0.5, abs=0.06)

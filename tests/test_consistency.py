@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import drawn
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -196,9 +197,9 @@ def run_on_own_model(
     found: list[tuple[Array, ...]] = []
     for time, dt in zip(np.cumsum(dts), dts, strict=True):
         rate = 2 * np.sin(waves[:, 0] * time + 3 * waves[:, 1])
-        x = truth.draw_state(start.space, x, Tick(time, dt, rate), rng)
+        x = drawn.next_state(truth, start.space, x, Tick(time, dt, rate), rng)
         control = rate[:, None] if controlled else None  # beside each member's sigma points
-        *_, last = wrong.step(belief, Tick(time, dt, control, truth.draw_readings(x, rng)), np.random.default_rng())
+        *_, last = wrong.step(belief, Tick(time, dt, control, drawn.readings(truth, x, rng)), np.random.default_rng())
         assert isinstance(last, UnscentedUpdate)
         belief, seen = last.belief, last.innovation
         own = [squared_distance(seen.residual[:, at], seen.cov[:, at, at]) for at in seen.space.axes_at.values()]

@@ -410,14 +410,14 @@ def test_post_mortem(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert done.out.splitlines()[-1] == "viz-estim debug failed.rrd"
     told = script(cli, monkeypatch, "failed.rrd", "where\nback\nstep\nstep\n")
     assert told[0].startswith(f"step 7  {stage}  ")
-    assert told[1].startswith("FAILED in ")
+    assert told[1].startswith("FAILED ")
     good = next(line for line in told if line.startswith("the last good belief"))
     assert "step 7  predict" in good
     text = "\n".join(told)
     assert "mean: x=8 m" in text if fate == "raises" else "mean: x=" in text
     assert "the run ends here: it failed in step 7" in text
     live = script(cli, monkeypatch, f"{tmp_path}/my.py:walk", "continue\nwhere", "--set", f"fate={fate}")
-    assert sum(line.startswith("FAILED in ") for line in live) == 2
+    assert sum(line.startswith("FAILED ") for line in live) == 2
 
 
 def test_a_failure_is_gone_on_from_with_other_parameters(cli: Cli, walk: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -425,7 +425,7 @@ def test_a_failure_is_gone_on_from_with_other_parameters(cli: Cli, walk: str, mo
     told = script(cli, monkeypatch, "failed.rrd", "set fails=99\ncontinue\nswitch 1\nwhere")
     assert told[0].startswith("step 26  predict")
     assert "step 39  update  (stage 66)  3.9000 s" in told
-    assert sum(line.startswith("FAILED in after predict: LinAlgError") for line in told) == 3
+    assert sum(line.startswith("FAILED after predict: LinAlgError") for line in told) == 3
 
 
 @pytest.mark.parametrize(

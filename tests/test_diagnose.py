@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from batches import together
 from conftest import Cli, strict
+from drawn import next_state
 from rerun.chunk import RrdReader
 from scipy.stats import kstest
 
@@ -84,7 +85,7 @@ def drawn(scenario: Scenario, rng: np.random.Generator) -> Scenario:
 def next_of(filter: Any, space: Any, x: Array, tick: Tick, rng: np.random.Generator) -> tuple[Array, dict[str, Array]]:
     """The next state, and the tick's readings of it."""
     if not isinstance(filter, AugmentedFilter):
-        x = filter.draw_state(space, x, tick, rng)
+        x = next_state(filter, space, x, tick, rng)
     elif tick.dt > 0:
         Q = filter.process_noise(tick)
         x = filter.process(x, rng.standard_normal(len(Q)) * np.sqrt(np.diag(Q)), tick)

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import drawn
 import numpy as np
 import pytest
 import scipy.io
@@ -129,8 +130,8 @@ def over_seeds(scenario: Scenario) -> tuple[Array, Array]:
     belief, x = Gaussian(SPACE, mean, cov), normal(SPACE, mean, cov, rng)
     nis, nees = [], []
     for tick in own.ticks:
-        x = own.estimator.draw_state(SPACE, x, tick, rng)
-        readings = own.estimator.draw_readings(x, rng) if tick.measurements else {}
+        x = drawn.next_state(own.estimator, SPACE, x, tick, rng)
+        readings = drawn.readings(own.estimator, x, rng) if tick.measurements else {}
         for stage in scenario.estimator.step(belief, Tick(tick.time, tick.dt, tick.control, readings), rng):
             belief = stage.belief
             if isinstance(stage, Update):

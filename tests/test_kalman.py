@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+import drawn
 import numpy as np
 import pytest
 
@@ -294,8 +295,8 @@ def test_it_is_consistent_on_data_of_its_own_model() -> None:
     nis, nees = [], []
     for k in range(300):
         tick = Tick(float(k), float(k > 0), rng.standard_normal(2))
-        x = estimator.draw_state(start.space, x, tick, rng)
-        readings = estimator.draw_readings(x, rng)
+        x = drawn.next_state(estimator, start.space, x, tick, rng)
+        readings = drawn.readings(estimator, x, rng)
         for stage in estimator.step(belief, Tick(tick.time, tick.dt, tick.control, readings), RNG):
             belief = stage.belief
             if isinstance(stage, Update) and stage.name == "update/two":

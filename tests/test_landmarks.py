@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import drawn
 import numpy as np
 import pytest
 from conftest import Cli
@@ -79,8 +80,8 @@ def on_own_model(factor: float) -> tuple[Array, Array]:
     dts = np.concatenate([[0.0], np.random.default_rng(0).uniform(0.05, 0.15, STEPS - 1)])
     errors, innovations = [], []
     for time, dt in zip(np.cumsum(dts), dts, strict=True):
-        x = right.draw_state(start.space, x, Tick(time, dt), any_rng)
-        tick = Tick(time, dt, None, right.draw_readings(x, any_rng))
+        x = drawn.next_state(right, start.space, x, Tick(time, dt), any_rng)
+        tick = Tick(time, dt, None, drawn.readings(right, x, any_rng))
         *_, last = wrong.step(belief, tick, np.random.default_rng())
         assert isinstance(last, Update)
         belief = last.belief

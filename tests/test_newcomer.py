@@ -1,7 +1,9 @@
 """What a newcomer stumbles over: files that are none, runs cut short at once, numbers that are none."""
 
+import contextlib
 import io
 import runpy
+import subprocess
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -45,6 +47,17 @@ def test_a_run_cut_off_before_its_first_stages_says_so(told: Path, tmp_path: Pat
         done = cli(*command, cut)
         assert (done.code, done.out) == (2, "")
         assert f"{cut}: the run was cut off before its first steps were written" in done.err
+
+
+@pytest.mark.parametrize(("stages", "where"), [([], "before its first stage"), (["predict"], "after predict")])
+def test_where_a_run_failed_is_told_in_words(stages: list[str], where: str, tmp_path: Path, cli: Cli) -> None:
+    with contextlib.suppress(ZeroDivisionError), viz_estim.record(tmp_path / "a.rrd", ["x"]) as rec:
+        for k in range(3):
+            for stage in ["predict"] if k < 2 else stages:
+                rec.stage(stage, mean=[0.0], cov=[[1.0]])
+            rec.step(time=-1 / (k - 2))
+    for command in ("show", "diagnose"):
+        assert f"step 2, {where}: ZeroDivisionError" in cli(command, tmp_path / "a.rrd").out
 
 
 def _has_steps_alone(content: bytes, path: Path) -> bool:
@@ -136,3 +149,23 @@ def test_the_package_is_a_program(monkeypatch: pytest.MonkeyPatch, capsys: pytes
         runpy.run_module("viz_estim", run_name="__main__")
     assert ended.value.code == 2
     assert "nowhere.rrd: no such recording" in capsys.readouterr().err
+
+
+PRESSED = """
+import signal, sys
+class Pressed:
+    def find_spec(self, name, *rest):
+        if name == "numpy":
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Pressed())
+sys.argv = ["viz-estim", "list"]
+"""
+
+
+@pytest.mark.parametrize(
+    "how",
+    ["import viz_estim.__main__ as m; m.entry()", "import runpy; runpy.run_module('viz_estim', run_name='__main__')"],
+)
+def test_ctrl_c_while_modules_are_read_is_as_quiet_as_later(how: str) -> None:
+    done = subprocess.run([sys.executable, "-c", PRESSED + how], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "viz-estim: interrupted\n")

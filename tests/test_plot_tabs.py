@@ -82,7 +82,8 @@ def test_a_pose_has_its_sigma_in_two_plots_of_a_unit_each() -> None:
 @pytest.mark.parametrize(
     ("name", "axis", "title"),
     [("accel", "x", "accel x"), ("heading", "angle", "heading"), ("range/1", "range", "range/1"), ("y", "y", "y"),
-     ("state", "vx", "vx"), ("range", "range0", "range0"), ("range", "rangefinder", "range rangefinder")],
+     ("state", "vx", "vx"), ("range", "range0", "range0"), ("range", "rangefinder", "range rangefinder"),
+     ("pose", "attitude.roll.angle", "pose attitude.roll")],
 )  # fmt: skip
 def test_a_title_says_nothing_twice(name: str, axis: str, title: str) -> None:
     assert plot_tabs.titled(name, axis) == title
@@ -102,11 +103,13 @@ def test_single_numbers_stand_one_below_the_other_and_are_named_in_words() -> No
     known = layout(Product(pose=SE2()), true_parts=[], stages=stages, particles=1200)
     figures = plot_tabs.tabs(known)[0]
     assert figures.name == "Figures"
-    assert [len(row.contents) for row in figures.contents] == [2, 2, 1]
+    assert [len(row.contents) for row in figures.contents] == [2, 2]
     assert [view.name for view in plots(figures)] == [
-        "weigh: log-evidence of the reading", "weigh: effective sample size, of 1200",
-        "resample: effective sample size, of 1200", "resample: distinct ancestors, of 1200", "resample: own",
+        "weigh: log-evidence of the reading", "weigh: effective sample size before resampling, of 1200",
+        "resample: distinct ancestors, of 1200", "resample: own",
     ]  # fmt: skip
+    alone = layout(Product(pose=SE2()), true_parts=[], stages={"resample": stages["resample"]}, particles=9)
+    assert len(plots(plot_tabs.tabs(alone)[0])) == 3  # nothing else tells its effective sample size
     plain = layout(Product(x=Euclidean(["x"])), stages={"update": {"ess": one, "rmse": one}}, true_parts=[])
     assert [view.name for view in plots(plot_tabs.tabs(plain)[0])] == ["update: ess", "update: rmse"]
 

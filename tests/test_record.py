@@ -407,7 +407,7 @@ def test_an_exception_is_the_run_s_failure(cli: Cli, tmp_path: Path, monkeypatch
     monkeypatch.setattr("sys.stdin", io.StringIO("back\n"))
     told = cli("debug", path, "--no-viewer").out.splitlines()
     assert told[0].startswith("step 20  predict")
-    assert told[1].startswith("FAILED in after predict: LinAlgError")
+    assert told[1].startswith("FAILED after predict: LinAlgError")
 
 
 BAD: dict[str, tuple[Callable[[Any], object], str]] = {

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from viz_estim.core import quaternions
 from viz_estim.core.descriptions import describe, rebuild
+from viz_estim.core.euler import EulerAngles
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import S2, SE2, SO2, SO3, Euclidean, Product, Space, wrap
 
@@ -16,7 +17,7 @@ Shape = tuple[int, ...]
 ORIGINS = {SO2: [0.0], SO3: [1.0, 0.0, 0.0, 0.0], SE2: [0.0, 0.0, 0.0], S2: [0.0, 0.0, 1.0]}
 KRAFT = Product(attitude=SO3(), rate=Euclidean(("x", "y", "z"), "rad/s"))
 GROUPS: list[Space] = [Euclidean(("a", "b"), ("m", "s")), SO2(), SO3(), SE2(), KRAFT]
-SPACES = [*GROUPS, S2(), Product(pose=SE2(), heading=SO2(), imu=KRAFT, up=S2())]
+SPACES = [*GROUPS, EulerAngles("zxy"), S2(), Product(pose=SE2(), heading=SO2(), imu=KRAFT, up=S2())]
 SIZES = [None, 0.0, 1e-15, 1e-9, np.pi - 1e-9, np.pi]
 spaces = pytest.mark.parametrize("space", SPACES, ids=lambda s: type(s).__name__)
 groups = pytest.mark.parametrize("space", GROUPS, ids=lambda s: type(s).__name__)

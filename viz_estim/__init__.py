@@ -47,7 +47,7 @@ def estimate_rot(
     import numpy as np
 
     from viz_estim.core import quaternions
-    from viz_estim.core.run import run
+    from viz_estim.core.run import failed_where, run
     from viz_estim.scenarios import imu, imu_data, imu_files
 
     file = imu_files.of_course(imu_file)
@@ -57,7 +57,7 @@ def estimate_rot(
     attitudes = []
     for step in run(scenario):
         if step.error:
-            raise ArithmeticError(f"{file}: step {step.index}, stage {step.error.stage}: {step.error.message}")
+            raise ArithmeticError(f"{file}: step {step.index}, {failed_where(step.error.stage)}: {step.error.message}")
         attitudes.append(step.stages[-1].belief.mean[:4])
     roll, pitch, yaw = quaternions.to_euler(np.stack(attitudes)).T
     return roll, pitch, yaw

@@ -10,6 +10,7 @@ from typing import IO, Any
 import numpy as np
 
 from viz_estim.core.consistency import nees, nis
+from viz_estim.core.euler import EulerAngles
 from viz_estim.core.quaternions import Array, exp
 from viz_estim.core.spaces import SE2, SO2, SO3, Euclidean, Product
 from viz_estim.errors import BadInput
@@ -43,6 +44,8 @@ def _write_tum(path: Path, run: Run, states: Array) -> Path:
         x = states[:, space.at[name]]
         if isinstance(part, SO3):
             attitude, posed = x, True
+        elif isinstance(part, EulerAngles):
+            attitude, posed = part.to_quaternion(x), True
         elif isinstance(part, SE2):
             position[:, :2], posed = x[:, :2], True
             attitude = exp(x[:, 2:] * [0.0, 0.0, 1.0])

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from viz_estim.core.consistency import band
+from viz_estim.core.run import failed_where
 from viz_estim.errors import one_line
 
 
@@ -15,7 +16,7 @@ def lines(result: dict[str, Any]) -> list[str]:
     found = []
     if result.get("error"):
         error = result["error"]
-        found.append(f"FAILED at step {error['step']}, stage {error['stage']}: {one_line(error['message'])}")
+        found.append(f"FAILED at step {error['step']}, {failed_where(error['stage'])}: {one_line(error['message'])}")
     width = max([24, *map(len, result["metrics"])])
     found += [f"  {name:{width}} {short(value)}" for name, value in result["metrics"].items()]
     for sensor, nis in result["nis"].items():

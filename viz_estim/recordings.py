@@ -26,7 +26,7 @@ from viz_estim import opened, told
 from viz_estim.core.beliefs import Belief, Categorical, Particles
 from viz_estim.core.consistency import Tally
 from viz_estim.core.quaternions import Array
-from viz_estim.core.run import Failure, Scenario, Step, Tick
+from viz_estim.core.run import FIRST, Failure, Scenario, Step, Tick
 from viz_estim.core.spaces import Euclidean, Product, Space
 from viz_estim.core.stages import Stage
 from viz_estim.files import check_writable
@@ -162,7 +162,7 @@ class Recording:
     def fail(self, error: BaseException, stage: str = "") -> None:
         """Ends the run with what was raised, in the step that is not ended, and in the stage of that name."""
         last = self._stages[-1].name if self._stages else ""
-        where = stage or (f"after {last}" if last else "first")
+        where = stage or (f"after {last}" if last else FIRST)
         self._failure = Failure(self._count, where, f"{type(error).__name__}: {error}")
 
     def close(self) -> None:

@@ -31,7 +31,8 @@ def watch(
     A step is a prediction with the updates after it. path: recordings/TYPE.rrd unless given; space: names, units and
     geometry of the state as in `record`; dt: seconds from one prediction to the next, of a filter that does not say;
     sensors: the readings' names and units as in `record`, by `z`, `z2`, … in the order in which they first come.
-    ValueError where an object is neither. Watched again, a filter begins a new recording.
+    ValueError where an object is neither, or where its methods can't be wrapped. Watched again, a filter begins a
+    new recording.
     """
     from viz_estim.watched_filters import of_filterpy, of_stonesoup
 
@@ -53,9 +54,13 @@ def watch(
     path = Path(path) if path else Path("recordings") / f"{type(filters[0]).__name__}.rrd"
     path.parent.mkdir(parents=True, exist_ok=True)
     recording = Watched(path, space, sensors or {})
-    for one, kind in zip(filters, kinds, strict=True):
-        assert kind
-        kind(one, recording, dt)
+    try:
+        for one, kind in zip(filters, kinds, strict=True):
+            assert kind
+            kind(one, recording, dt)
+    except ValueError:  # of an object whose methods can't be wrapped: the others are as before
+        recording.close()
+        raise
     return recording
 
 
@@ -94,8 +99,7 @@ class Watched(Recording):
             return result
 
         setattr(wrapped, _MARK, self)
-        setattr(owner, name, wrapped)
-        self._undo.append(functools.partial(_unwrap, owner, name, wrapped))
+        self._undo.append(_put(owner, name, wrapped))
 
     def begin(self, time: float) -> None:
         """A step begins: the one before, if any, has ended."""
@@ -120,7 +124,7 @@ class Watched(Recording):
 
     def close(self) -> None:
         """Ends the recording and leaves the objects as they were."""
-        for undo in self._undo:
+        for undo in reversed(self._undo):
             undo()
         self._undo = []
         if self._stages and self.now is not None:
@@ -138,6 +142,29 @@ class Watched(Recording):
             self.say(f"recorded up to step {max(self._count - 1, 0)} alone ({type(error).__name__}: {one_line(error)})")
 
 
-def _unwrap(owner: Any, name: str, wrapped: Any) -> None:
+def _put(owner: Any, name: str, wrapped: Any) -> Callable[[], None]:
+    """Sets a method of the object, and gives what undoes it; ValueError where there is no way to."""
+    kind = type(owner)
+    try:
+        if hasattr(owner, "__dict__"):
+            own = vars(owner).get(name)
+            setattr(owner, name, wrapped)
+            return functools.partial(_take, owner, name, wrapped, own)
+        # An object with `__slots__` has no room for it, but a class beneath its own has: same layout, and this method.
+        beneath = {"__slots__": (), "__module__": kind.__module__, name: staticmethod(wrapped)}
+        owner.__class__ = type(kind.__name__, (kind,), beneath)
+        return functools.partial(setattr, owner, "__class__", kind)
+    except (AttributeError, TypeError) as error:
+        raise ValueError(
+            f"{kind.__name__}: its {name} can't be wrapped ({one_line(error)}); let its class take attributes, or "
+            "record it by viz_estim.record"
+        ) from None
+
+
+def _take(owner: Any, name: str, wrapped: Any, own: Any) -> None:
+    """Takes the wrapped method away, if it is still there, and gives the object back the one that was its own."""
     if vars(owner).get(name) is wrapped:
-        delattr(owner, name)
+        if own is None:
+            delattr(owner, name)
+        else:
+            setattr(owner, name, own)

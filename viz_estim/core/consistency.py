@@ -14,6 +14,7 @@ import numpy as np
 from viz_estim.core import quaternions
 from viz_estim.core.discrete import categorical_metrics
 from viz_estim.core.distributions import chi2
+from viz_estim.core.euler import EulerAngles
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, SO3, Product, Space, wrap
 
@@ -55,8 +56,8 @@ def rms(error: Array) -> float:
 def metrics(space: Space, mean: Array, truth: Array) -> dict[str, float]:
     """Errors by part of the state, over the steps whose truth is known; names carry their units.
 
-    mean, truth (T, n). Attitudes: the geodesic angle, roll, pitch and yaw beside it, and the tilt (the angle between
-    the estimated and the true direction of gravity).
+    mean, truth (T, n). Attitudes, in whatever way they are kept: the geodesic angle, beside it roll, pitch and yaw of
+    R = Rz(yaw)·Ry(pitch)·Rx(roll), and the tilt (the angle between the estimated and the true direction of gravity).
     """
     parts = space.parts if isinstance(space, Product) else {"state": space}
     at = space.at if isinstance(space, Product) else {"state": slice(0, len(space.names))}
@@ -72,6 +73,8 @@ def metrics(space: Space, mean: Array, truth: Array) -> dict[str, float]:
 def _errors(name: str, part: Space, x: Array, y: Array) -> dict[str, float]:
     if isinstance(part, SO3):
         return _attitude(x, y)
+    if isinstance(part, EulerAngles):
+        return _attitude(part.to_quaternion(x), part.to_quaternion(y))
     if isinstance(part, SE2):
         turn = wrap(x[:, 2:] - y[:, 2:])
         place = x[:, :2] - y[:, :2]

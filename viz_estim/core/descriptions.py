@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from viz_estim.core.euler import EulerAngles
 from viz_estim.core.spaces import S2, SE2, SO2, SO3, Euclidean, Product, Space
 
 _PLAIN: dict[str, Any] = {kind.__name__: kind for kind in (SO2, SO3, SE2, S2)}
@@ -11,6 +12,8 @@ _PLAIN: dict[str, Any] = {kind.__name__: kind for kind in (SO2, SO3, SE2, S2)}
 
 def describe(space: Space) -> dict[str, Any]:
     """The space as JSON-ready data, which `rebuild` turns back."""
+    if isinstance(space, EulerAngles):
+        return {"kind": "EulerAngles", "order": space.order}
     if isinstance(space, Product):
         return {"kind": "Product", "parts": {name: describe(part) for name, part in space.parts.items()}}
     if isinstance(space, Euclidean):
@@ -20,6 +23,8 @@ def describe(space: Space) -> dict[str, Any]:
 
 def rebuild(description: dict[str, Any]) -> Space:
     """The space that `describe` described."""
+    if description["kind"] == "EulerAngles":
+        return EulerAngles(description["order"])
     if description["kind"] == "Product":
         return Product(**{name: rebuild(part) for name, part in description["parts"].items()})
     if description["kind"] == "Euclidean":

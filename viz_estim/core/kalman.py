@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from viz_estim.core.beliefs import Gaussian, normal, read_only
+from viz_estim.core.beliefs import Gaussian, read_only
 from viz_estim.core.measurement import Measurement, Sensor, gain, symmetrised, transposed
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick
@@ -102,16 +102,6 @@ class KalmanFilter:
                 stage = update(belief, tick.measurements[name], measurement, name=title)
                 yield stage
                 belief = stage.belief
-
-    def draw_state(self, space: Space, x: Array, tick: Tick, rng: np.random.Generator) -> Array:
-        """A true next state (*, n) from the filter's own process model: what its consistency is tested on."""
-        if tick.dt == 0:
-            return x
-        return normal(space, self.process(x, tick), self.process_noise(x, tick), rng)
-
-    def draw_readings(self, x: Array, rng: np.random.Generator) -> dict[str, Array]:
-        """Readings of a true state x (*, n) from the filter's own sensors."""
-        return {k: normal(s.space, s.measure(x), s.noise, rng) for k, s in self.sensors.items()}
 
 
 def linear(F: Array, Q: Array, sensors: Mapping[str, Sensor], B: Array | None = None) -> KalmanFilter:

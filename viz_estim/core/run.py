@@ -66,6 +66,16 @@ class Failure:
     message: str
 
 
+FIRST = "first"  # for a stage: there was none yet
+
+
+def failed_where(stage: str) -> str:
+    """A failure's stage in words: in one, after one, or before the step's first."""
+    if stage == FIRST:
+        return "before its first stage"
+    return stage if stage.startswith("after ") else f"in {stage}"
+
+
 @dataclass(frozen=True, slots=True)
 class Step:
     """What is recorded of one moment: the tick, the stages in order, the truth (n,) or None, the failure if any."""
@@ -185,4 +195,4 @@ def _failing_stage(stages: list[Stage], failure: Exception) -> str:
     last = stages[-1].name if stages else "start"
     if isinstance(failure, NotFinite):
         return last
-    return str(getattr(failure, "stage", f"after {last}" if stages else "first"))
+    return str(getattr(failure, "stage", f"after {last}" if stages else FIRST))

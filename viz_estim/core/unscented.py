@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viz_estim.core.beliefs import Gaussian, normal, read_only
+from viz_estim.core.beliefs import Gaussian, read_only
 from viz_estim.core.measurement import Measurement, Sensor, gain, symmetrised, transposed
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick
@@ -189,14 +189,6 @@ class UnscentedFilter:
                 noise[self.measurement.block(name)] = tick.stand_ins[name].noise
         z = np.concatenate(readings, axis=-1)
         yield update(belief, z, self.measurement, self.rule, sigma=sigma, noise=noise, offered=offered)
-
-    def draw_state(self, space: Space, x: Array, tick: Tick, rng: np.random.Generator) -> Array:
-        """A true next state (*, n) from the filter's own process model: what its consistency is tested on."""
-        return x if tick.dt == 0 else self.process(normal(space, x, self.process_noise(tick), rng), tick)
-
-    def draw_readings(self, x: Array, rng: np.random.Generator) -> dict[str, Array]:
-        """Readings of a true state x (*, n) from the filter's own sensors."""
-        return {k: normal(s.space, s.measure(x), s.noise, rng) for k, s in self.measurement.sensors.items()}
 
 
 @dataclass(frozen=True)

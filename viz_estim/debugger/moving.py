@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from viz_estim.core.run import failed_where
 from viz_estim.debugger import expressions
 from viz_estim.debugger.branches import Branch
 from viz_estim.debugger.breakpoints import Breakpoint
@@ -159,7 +160,7 @@ class Moving(Console):
         failure = self.branch.source.failure
         if not failure or self.place != self.branch.source.span(failure.step)[-1]:
             return ""
-        return f"\nFAILED in {failure.stage}: {' '.join(failure.message.split())}"
+        return f"\nFAILED {failed_where(failure.stage)}: {' '.join(failure.message.split())}"
 
     def _ended(self) -> str:
         failure = self.branch.source.failure

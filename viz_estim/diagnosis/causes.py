@@ -15,7 +15,7 @@ from viz_estim.core.spaces import Euclidean
 from viz_estim.diagnosis.axes import explains, maps
 from viz_estim.diagnosis.finding import level
 from viz_estim.diagnosis.fits import Against, Fitted, fitted, white
-from viz_estim.diagnosis.naming import named, of_reading
+from viz_estim.diagnosis.naming import SIGNS, likeliest, named, of_reading
 
 _SPAN = 0.1  # s over which a rate is taken at least: noise of the truth would hide it in a shorter one
 _SQUARE = "squares"
@@ -178,12 +178,15 @@ def scaled(one: Against) -> Iterator[Cause]:
     factor = 1 + float(fit.coefficients[0])
     unit_size = float(np.sqrt(np.mean(white(one, one.true) ** 2)))
     foreseen = float(np.sqrt(np.mean(one.foreseen / np.diagonal(one.noise, axis1=1, axis2=2))))
+    known, error = of_reading(one.space.axis_units[0]), float(fit.error[0])
+    sign = likeliest(factor, known, error) in SIGNS
     yield Cause(
         "units_or_axes", fit.gain, 1, float(fit.p[0]), fit.p_beyond(0, foreseen / max(unit_size, 1e-300)),
         abs(factor - 1) * unit_size, fit.explained, {"map": f"a factor of {factor:.4g}", "factor": factor},
         f"readings of {one.label} are {factor:.4g}× what the truth would give: "
-        f"{named(factor, of_reading(one.space.axis_units[0]), float(fit.error[0]))}",
-        f"divide the readings of {one.label} by {factor:.4g}, or calibrate its scale",
+        f"{named(factor, known, error)}",
+        f"change the sign of {one.label}" if sign else f"divide the readings of {one.label} by {factor:.4g}, or "
+        "calibrate its scale",
     )  # fmt: skip
 
 

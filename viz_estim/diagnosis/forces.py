@@ -17,6 +17,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3, Euclidean
 from viz_estim.diagnosis.axes import maps
 from viz_estim.diagnosis.clouds import WINDOW
+from viz_estim.diagnosis.directions import NOT_TURNED, TURNED_BACK
 from viz_estim.diagnosis.durations import by_biases, whole
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import EXPLAINED, ODDS, Finding, judge
@@ -29,13 +30,16 @@ _EXCHANGED = "gyro and accelerometer"
 
 
 class Pulled(NamedTuple):
-    """By window (W,) the forces (W, 3) m/s² that the truth shows and that were predicted by; rates (W, 3) rad/s too."""
+    """By window (W,) the forces (W, 3) m/s² that the truth shows and that were predicted by; rates (W, 3) rad/s too.
+    plain, back: the force that was predicted by, had it not been turned into the world, or the wrong way."""
 
     step: np.ndarray
     truly: Array
     told: Array
     turns: Array
     turned: Array
+    plain: Array
+    back: Array
 
 
 def pulled(case: Case) -> Pulled | None:
@@ -64,10 +68,12 @@ def pulled(case: Case) -> Pulled | None:
         return None
     name = next(name for name in space.parts if space.at[name] == v)
     change = by.after[kept][:, v] - by.before[kept][:, v] - by_biases(case, tables[0], by, name)[kept]
-    told, turned = _force(by.before[kept][:, q], by.after[kept][:, q], change, dt[kept])
+    told, turned, middle = _force(by.before[kept][:, q], by.after[kept][:, q], change, dt[kept])
     true = run.truth[row[kept]], run.truth[past[kept]]
-    truly, turns = _force(true[1][:, q], true[0][:, q], true[0][:, v] - true[1][:, v], run.dt[row[kept]])
-    means = (values.reshape(-1, n, 3).mean(1) for values in (truly, told, turns, turned))
+    plain = quaternions.rotate(middle, told)
+    back = quaternions.rotate(middle, plain)
+    truly, turns, _ = _force(true[1][:, q], true[0][:, q], true[0][:, v] - true[1][:, v], run.dt[row[kept]])
+    means = (values.reshape(-1, n, 3).mean(1) for values in (truly, told, turns, turned, plain, back))
     return Pulled(by.step[kept[::n]], *means)
 
 
@@ -77,11 +83,12 @@ def foreseen(values: Array, left: float) -> bool:
     return bool(0.5 * values.size * np.log(float(np.square(values).sum()) / max(left, 1e-300)) > np.log(ODDS))
 
 
-def _force(before: Array, after: Array, change: Array, dt: Array) -> tuple[Array, Array]:
-    """The force (M, 3) in the body's axes at the middle of its turn, and the rate (M, 3) of that turn."""
+def _force(before: Array, after: Array, change: Array, dt: Array) -> tuple[Array, Array, Array]:
+    """The force (M, 3) in the body's axes at the middle of its turn, the rate (M, 3) of that turn, and that middle."""
     turn = quaternions.log(quaternions.multiply(quaternions.conjugate(before), after))
     middle = quaternions.multiply(before, quaternions.exp(0.5 * turn))
-    return quaternions.rotate(quaternions.conjugate(middle), change / dt[:, None] + _UP), turn / dt[:, None]
+    force = quaternions.rotate(quaternions.conjugate(middle), change / dt[:, None] + _UP)
+    return force, turn / dt[:, None], middle
 
 
 def forces(case: Case) -> Iterator[Finding]:
@@ -95,6 +102,8 @@ def forces(case: Case) -> Iterator[Finding]:
     own = float(np.square(truly - told).sum())
     tried = [(float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title, A) for title, A in maps(3, "m/s²")]
     tried.append((float(np.square(told - found.turns).sum()), _EXCHANGED, np.eye(3)))
+    for what, values in ((NOT_TURNED, found.plain), (TURNED_BACK, found.back)):
+        tried.append((float(np.square(truly - values).sum()), what, np.eye(3)))
     left = min(one[0] for one in tried)
     explained = 1 - left / max(own, 1e-300)
     gain = 0.5 * truly.size * float(np.log(own / max(left, 1e-300)))
@@ -103,7 +112,7 @@ def forces(case: Case) -> Iterator[Finding]:
     # Of those that explain it as well (a force along one axis tells nothing of the others) the least change.
     alike = [one for one in tried if 0.5 * truly.size * np.log(one[0] / max(left, 1e-300)) < np.log(ODDS)]
     what = max(alike, key=lambda one: float(np.trace(one[2])))[1]
-    if what != _EXCHANGED and not foreseen(told, left):
+    if what not in (_EXCHANGED, NOT_TURNED, TURNED_BACK) and not foreseen(told, left):
         return
     steps = int(found.step[0]), int(found.step[-1])
     evidence = {"component": "force", "map": what, "explained": explained, "gain": gain, "against": "truth"}
@@ -112,8 +121,16 @@ def forces(case: Case) -> Iterator[Finding]:
             "process_model", "error", None, steps, evidence,
             "the velocity is predicted by the body's turn rates in place of its specific force: gyro and accelerometer "
             f"are exchanged (this explains {explained:.0%} of the difference)",
-            "check the order of the control's numbers: which three are the gyro's (rad/s), and which the "
-            "accelerometer's (m/s², about 9.81 long)",
+            "check the order of the six numbers: which three are the gyro's (rad/s), and which the accelerometer's "
+            "(m/s², about 9.81 long)",
+        )  # fmt: skip
+        return
+    if what in (NOT_TURNED, TURNED_BACK):
+        yield Finding(
+            "process_model", "error", None, steps, evidence,
+            f"the velocity is predicted by the body's specific force, {what}: this explains {explained:.0%} of the "
+            "difference",
+            "turn the force of the body into the world's axes before it is added: a = R·f + g, R being world from body",
         )  # fmt: skip
         return
     words = f"as {what}" if what.startswith("axes") else f"by a factor ({what})"

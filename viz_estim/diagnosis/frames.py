@@ -21,9 +21,9 @@ def turned(one: Against) -> Iterator[Cause]:
         return
     for shifted in (False, True):
         z0, t0 = (one.z.mean(0), one.true.mean(0)) if shifted else (np.zeros(m), np.zeros(m))
-        R = _kabsch(one.true - t0, one.z - z0)
+        R = kabsch(one.true - t0, one.z - z0)
         left = float((white(one, one.z - z0 - (one.true - t0) @ R.T) ** 2).sum())
-        angle, about = _angle(R)
+        angle, about = angle_of(R)
         where = f"{np.degrees(angle):.0f}°" + (f" about {about}" if about else "")
         again = f" and moved by ({', '.join(f'{v:.2g}' for v in z0 - R @ t0)}) {one.space.axis_units[0]}"
         yield from _turn(one, left, (1 if m == 2 else 3) + m * shifted, where + again * shifted, "")
@@ -42,7 +42,7 @@ def turned_attitudes(one: Against) -> Iterator[Cause]:
         D = _mean(difference)
         should = quaternions.multiply(D, true) if side == 0 else quaternions.multiply(true, D)
         left = float((white(one, one.space.minus(z, should)) ** 2).sum())
-        angle, about = _angle(quaternions.to_matrix(D))
+        angle, about = angle_of(quaternions.to_matrix(D))
         yield from _turn(one, left, 3, f"{np.degrees(angle):.0f}°" + (f" about {about}" if about else ""), f": {words}")
 
 
@@ -154,7 +154,7 @@ def _alike(one: Against, other: Against) -> bool:
     )
 
 
-def _kabsch(a: Array, b: Array) -> Array:
+def kabsch(a: Array, b: Array) -> Array:
     """The rotation (m, m) that brings vectors a to b (M, m) best."""
     U, _, Vt = np.linalg.svd(b.T @ a)
     sign = np.ones(len(U))
@@ -167,7 +167,7 @@ def _mean(q: Array) -> Array:
     return np.asarray(np.linalg.eigh(q.T @ q)[1][:, -1])
 
 
-def _angle(R: Array) -> tuple[float, str]:
+def angle_of(R: Array) -> tuple[float, str]:
     """How far a rotation turns (rad), and about which axis."""
     if len(R) == 2:
         return float(np.arctan2(R[1, 0], R[0, 0])), ""

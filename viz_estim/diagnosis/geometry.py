@@ -8,13 +8,15 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, Euclidean, Product, Space, wrap
-from viz_estim.diagnosis.axes import explains, finding_of, maps
+from viz_estim.diagnosis.axes import explains, finding_of, maps, units
 from viz_estim.diagnosis.covariance import epsilon
 from viz_estim.diagnosis.evidence import Case, Readings, tells_reading
-from viz_estim.diagnosis.finding import HALF_THE_DIGITS, Finding, level
+from viz_estim.diagnosis.finding import GROSS, HALF_THE_DIGITS, SHEET, Finding, level
+from viz_estim.diagnosis.fits import slope
 from viz_estim.diagnosis.kinematics import imu_axes, scale
 from viz_estim.recording.layout import leaves
 
+_FAR = 3.0  # standard errors
 _TURNS = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0, "": None}  # by unit; unknown where none is told
 
 
@@ -155,7 +157,8 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         sound = np.isfinite(readings.nis) & np.isfinite(readings.z).all(1) & np.isfinite(readings.predicted).all(1)
         z, predicted, precision = readings.z[sound], readings.predicted[sound], np.linalg.inv(readings.cov[sound])
         best, what = np.inf, ""
-        for title, M in maps(len(space.axes), space.axis_units[0]):
+        unit = space.axis_units[0]
+        for title, M in maps(len(space.axes), unit):
             off = z - predicted @ np.linalg.inv(M).T
             value = float(np.einsum("ti,tij,tj->", off, precision, off))
             if value < best:
@@ -163,5 +166,29 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         gain, explained = 0.5 * (own - best), 1 - best / max(own, 1e-300)
         nothing = float(np.einsum("ti,tij,tj->", z, precision, z))
         sure = gain > -np.log(level("error", 60 * len(case.sensors)))
-        if sure and explains(what, own, best, nothing, z.size):
+        if (
+            sure
+            and explains(what, own, best, nothing, z.size)
+            and singled_out(z, predicted, np.asarray(precision, float), what, unit)
+        ):
             yield finding_of(name, readings.steps, what, explained, gain)
+
+
+def singled_out(z: Array, predicted: Array, precision: Array, what: str, unit: str) -> bool:
+    """Whether of all factors known, and none, the map alone brings what was expected (M, m) to the readings (M, m). The
+    factor lies between the slope of the one on the other and that of the other on the one, each with its error. Of an
+    estimate that has gone elsewhere, that is far: then readings tell nothing of their unit."""
+    M = dict(maps(z.shape[1], unit))[what]
+    if not (np.linalg.eigvalsh(precision)[:, 0] > 0).all():
+        return False
+    L = np.linalg.cholesky(precision)
+    y, x = (np.einsum("tji,tj->ti", L, v).ravel() for v in (z, predicted @ np.linalg.inv(M).T))
+    forth, back = slope(y, x), slope(x, y)
+    if forth.value <= 0 or back.value <= 0:
+        return False
+    low, high = sorted((np.log(forth.value), -np.log(back.value)))
+    wide = _FAR * max(forth.error / forth.value, back.error / back.value) + SHEET
+    scale = 1.0 if what.startswith("axes") else units(unit)[what]
+    others = [0.0 if what.startswith("axes") else np.log(scale), *(np.log(scale / f) for f in units(unit).values())]
+    known = wide < np.log(GROSS) and low - wide < 0 < high + wide
+    return bool(known and not any(low - wide < off < high + wide for off in others if abs(off) > SHEET))

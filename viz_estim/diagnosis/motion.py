@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from viz_estim.core.quaternions import Array
-from viz_estim.core.spaces import SO2, SO3, wrap
-from viz_estim.diagnosis import clouds, forces
+from viz_estim.core.spaces import SO2, SO3, Euclidean, wrap
+from viz_estim.diagnosis import clouds, directions, forces
 from viz_estim.diagnosis.against import FEWEST
 from viz_estim.diagnosis.against import slip as bound
 from viz_estim.diagnosis.axes import maps
@@ -17,7 +17,7 @@ from viz_estim.diagnosis.durations import composed, whole
 from viz_estim.diagnosis.evidence import Case, transitions
 from viz_estim.diagnosis.finding import EXPLAINED, ODDS, SHEET, Finding, judge
 from viz_estim.diagnosis.fits import slope
-from viz_estim.diagnosis.naming import likeliest, named, of_motion
+from viz_estim.diagnosis.naming import SIGNS, likeliest, named, of_motion
 
 _GRAVITY = 9.81  # m/s²
 _WORLD = "the world's axes"
@@ -78,6 +78,7 @@ def prediction(case: Case) -> Iterator[Finding]:
             axis, unit = case.space.axes[i].rpartition(".")[2], case.space.axis_units[i]
             label = name if axis in ("", name, "angle") else f"{name} {axis}"
             told_of += _moves_as(label, unit, of, w[near], told[near], dt[near], slip[near], 2 * d, by.times)
+    headings = [case.space.at[name] for name, part in case.space.parts.items() if isinstance(part, SO2)]
     for name, part in case.space.parts.items():
         axes = range(case.space.axes_at[name].start, case.space.axes_at[name].stop)
         if isinstance(part, SO3) and all(i in moving and len(moving[i][0]) == len(moving[axes[0]][0]) for i in axes):
@@ -85,6 +86,21 @@ def prediction(case: Case) -> Iterator[Finding]:
             if (found := _turns_as(name, truly, told, moving[axes[0]][2])) is not None:
                 yield found
                 return
+        if isinstance(part, Euclidean) and len(set(part.axis_units)) == 1 and 2 <= len(axes) <= 3 and all(
+            i in moving and np.array_equal(moving[i][2], moving[axes[0]][2]) for i in axes
+        ):  # fmt: skip
+            truly, told = (np.stack([moving[i][k] for i in axes], axis=-1) for k in (0, 1))
+            of = moving[axes[0]][2]
+            heading = run.truth[np.searchsorted(run.step, of) - 1, headings[0]][:, 0] if len(headings) == 1 else None
+            heading = heading if heading is not None and np.isfinite(heading).all() else None
+            if (found := directions.turned(name, truly, told, heading, of)) is not None:
+                yield found
+                return
+            own = {name if axis in ("", name) else f"{name} {axis}" for axis in part.axes}
+            told_of = [
+                (share, directions.of_all(f, name, truly, told) if f.evidence["component"] in own else f)
+                for share, f in told_of
+            ]
     yield from _best(told_of) if told_of else map(_by_estimate, _elsewhere(case))
 
 
@@ -151,7 +167,7 @@ def _exchanged(truly: Array, told: Array, of: np.ndarray) -> Finding | None:
         {"component": "control", "map": "exchanged", "explained": explained, "against": "truth"},
         f"the prediction goes ahead by what the truth turns by, and turns by what it goes ahead ({explained:.0%} of "
         "the difference): speed and turn rate are exchanged",
-        "check the order of the control's numbers",
+        "check the order in which the prediction takes the speed and the turn rate",
     )  # fmt: skip
 
 
@@ -203,7 +219,7 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Ar
         "process_model", "error", None, (int(of[0]), int(of[-1])),
         {"component": name, "map": what, "explained": explained, "against": "truth"},
         f"{name} is predicted to turn otherwise than it does: {words} would explain {explained:.0%} of the difference",
-        f"check the order, the signs and the unit of the control that turns {name}: the best map is `{what}`",
+        f"check the order, the signs and the unit of the rates that turn {name}: the best map is `{what}`",
     )  # fmt: skip
 
 
@@ -240,20 +256,22 @@ def _moves_as(
         p = max(forth.p_beyond(0.0), aback.p_beyond(0.0))
         severity = judge(p, tests, large=max(forth.p_beyond(SHEET), aback.p_beyond(SHEET)))
         cause = f"{label} is predicted to move by {factor:.3g}× what it does: {named(factor, told_as, error)}"
-        remedy = (
-            f"look at the control that moves {label}: its sign, its unit, its calibration (divide it by {factor:.3g})"
-        )
+        todo = f"its sign, its unit, its calibration (divide it by {factor:.3g})"
+        todo = "change its sign" if likeliest(factor, told_as, error) in SIGNS else todo
+        remedy = f"look at what moves {label}, a control or a rate: {todo}"
         evidence: dict[str, object] = {"component": label, "factor": factor, "p": p}
     else:
         p_drift = steady.p_beyond(0.0)
         severity = judge(p_drift, tests, large=steady.p_beyond(SHEET * float(np.abs(told).mean())))
         rate = f"{unit}²" if unit.endswith("/s") else f"{unit}/s"
         cause = (
-            f"the prediction misses a steady {drift:+.3g} {rate} of {label}: the control that moves it has a bias, "
-            "or a force is missing from the model"
+            f"the prediction misses a steady {drift:+.3g} {rate} of {label}: what moves it, a control or a rate, has "
+            "a bias, or a force is missing from the model"
         )
         if 0.5 * len(w) * np.log(left_factor / max(left_drift, 1e-300)) < np.log(ODDS):  # it was always told the same
-            cause += f"; or it moves by {1 / (1 + beta):.3g}× what it does, which looks alike at one speed"
+            turned = likeliest(ends[0], of_motion(unit, 0.0), forth.error * ends[0] ** 2) in SIGNS
+            it = "its sign is wrong" if turned else f"it moves by {ends[0]:.3g}× what it does"
+            cause += f"; or {it}, which looks alike at one speed"
         remedy = f"calibrate that bias ({drift:+.3g} {rate}), or add it to the state and let the filter estimate it"
         for times, what in ((1, "not added, or added twice"), (2, "added with the wrong sign")):
             if rate == "m/s²" and abs(abs(drift) / (times * _GRAVITY) - 1) < SHEET:

@@ -11,6 +11,9 @@ _FAR = 3.0  # standard deviations: one of 370 right names is lost by it
 _CALIBRATED = 0.5 * SHEET  # of a factor, one standard deviation
 
 
+SIGNS = [["a wrong sign"], ["its sign is wrong"]]  # of a reading, of a motion: names that a sign alone has
+
+
 def named(factor: float, known: dict[str, float], error: float = 0.0) -> str:
     """In words, of a factor with this standard error: one of the known ones, or several that are as likely."""
     found = likeliest(factor, known, error)
@@ -31,7 +34,7 @@ def likeliest(factor: float, known: dict[str, float], error: float = 0.0) -> lis
 def of_reading(unit: str) -> dict[str, float]:
     """The factors of a reading that is mistaken."""
     known = {name: 1 / value for name, value in units(unit).items()}
-    return known | {"a sign": -1.0, "twice, as a round trip taken for the way there": 2.0}
+    return known | {"a wrong sign": -1.0, "twice, as a round trip taken for the way there": 2.0}
 
 
 def of_motion(unit: str, dt: float, times: int = 1) -> dict[str, float]:

@@ -7,6 +7,7 @@ from itertools import groupby
 import numpy as np
 import rerun.blueprint as rrb
 
+from viz_estim.core.quaternions import Array
 from viz_estim.recording import links, plot_tabs, schema
 from viz_estim.recording.compared import Compared
 from viz_estim.recording.pictures import CANVAS, PANORAMA
@@ -15,7 +16,8 @@ from viz_estim.recording.scene_views import Scenes, flat, view
 from viz_estim.recording.sheet import Plot
 
 _Item = rrb.Container | rrb.View
-_FEW = 3  # runs up to which a plot has room for their legend
+_SHORT = 0.4  # of the whole: where all runs are in less of it, plots show that part
+_FEW, _MORE = 3, 4  # runs up to which a plot has room for their legend; and one that has a row for itself
 _NAMES = {"attitude": "attitude", "world": "world [m]", "bars": "probabilities", "canvas": "mosaic [deg]"}
 _TABS = {
     "difference": "Difference", "belief": "Belief", "error": "Errors", "state": "State", "sigma": "σ",
@@ -35,9 +37,12 @@ def build(runs: list[Compared], scenes: Scenes, plots: list[Plot], ranges: Range
         plot_tabs.lanes(f"{run.path}{schema.LANES}", f"{run.title}: stage, and each sensor's readings") for run in runs
     ]
     beneath.append(rrb.Grid(*lanes, grid_columns=1 if len(runs) <= 3 else 3, name="Lanes"))
+    shared = shared_part([run.run.time for run in runs])
+    if shared:
+        notes = f"Plots show {shared[0]:g} to {shared[1]:g} s, where all runs are; zoom out for the rest.\n\n{notes}"
     beneath.append(links.panel(schema.NOTES, "What was compared", notes))
     duration = max(float(run.run.time[-1] - run.run.time[0]) for run in runs)
-    beneath = [plot_tabs.show_all(tab, duration) for tab in beneath]
+    beneath = [plot_tabs.show_from(tab, *shared) if shared else plot_tabs.show_all(tab, duration) for tab in beneath]
     tabs = rrb.Tabs(*beneath, name="over time", active_tab=0)
     rows: list[_Item] = [rrb.Tabs(*above, active_tab=0) if len(above) > 1 else above[0], tabs] if above else [tabs]
     shares = [1.0] if not above else [0.85, 1.0] if len(runs) <= 3 else [1.1, 1.0]
@@ -47,6 +52,13 @@ def build(runs: list[Compared], scenes: Scenes, plots: list[Plot], ranges: Range
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
+
+
+def shared_part(times: list[Array]) -> tuple[float, float] | None:
+    """The part (s) in which all runs are, where plots of the whole would be mostly empty; else None."""
+    start, end = max(float(t[0]) for t in times), min(float(t[-1]) for t in times)
+    whole = max(float(t[-1]) for t in times) - min(float(t[0]) for t in times)
+    return (start, end) if 0 < end - start < _SHORT * whole else None
 
 
 def _scenes(runs: list[Compared], scenes: Scenes) -> list[_Item]:
@@ -71,8 +83,8 @@ def _scenes(runs: list[Compared], scenes: Scenes) -> list[_Item]:
 def _tabs(title: str, plots: list[Plot], ranges: Ranges, runs: int, *, named: bool) -> list[_Item]:
     """Plots in rows, those of one part of the state together; in as many tabs as keep them readable.
 
-    A legend where a plot has a run that none before it on the tab has; of many runs where that plot has a row for
-    itself, or where no scene above names them.
+    A legend where a plot has a run that none before it on the tab has; of more runs where that plot has a row for
+    itself. Of those that are too many for that, which would be cut off, only where no scene above names them.
     """
     rows: list[list[Plot]] = []
     for _, members in groupby(plots, key=lambda plot: plot.row):
@@ -89,10 +101,11 @@ def _tabs(title: str, plots: list[Plot], ranges: Ranges, runs: int, *, named: bo
         shown: set[int] = set()
         lines = []
         for row in rows[i : i + size]:
+            roomy = runs <= _FEW or (len(row) == 1 and runs <= _MORE)
             line = []
             for plot in row:
                 new = not plot.runs <= shown
-                line.append(_plot(plot, ranges, legend=new and (runs <= _FEW or len(row) == 1 or not named)))
+                line.append(_plot(plot, ranges, legend=new and (roomy or not named)))
                 shown |= plot.runs
             lines.append(rrb.Horizontal(*line))
         found.append(rrb.Vertical(*lines, name=f"{title} {len(found) + 1}" if found else title))

@@ -128,20 +128,17 @@ def _belief(alone: Alone) -> list[_Plots]:
 
 
 def _figures(alone: Alone) -> list[_Plots]:
+    by_stage = {
+        table.name: [f for f, values in table.values.items() if is_figure(f, values) and np.isfinite(values).any()]
+        for table in alone.run.stages.values()
+    }
+    particles = alone.run.properties.get("particles", {}).get("count")
     groups = [
         [
-            graph("figure", f"{table.name}.{name}", f"{table.name}: {words}")
-            for name, words in plot_tabs.figure_names(
-                [
-                    name
-                    for name, values in table.values.items()
-                    if is_figure(name, values) and np.isfinite(values).any()
-                ],
-                fit=_registered(alone),
-                particles=alone.run.properties.get("particles", {}).get("count"),
-            ).items()
+            graph("figure", f"{stage}.{name}", f"{stage}: {words}")
+            for name, words in plot_tabs.figure_names(numbers, fit=_registered(alone), particles=particles).items()
         ]
-        for table in alone.run.stages.values()
+        for stage, numbers in plot_tabs.figures_once(by_stage).items()
     ]
     return [group for group in groups if group]
 

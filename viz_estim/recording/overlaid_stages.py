@@ -11,7 +11,7 @@ from viz_estim.core.spaces import Product
 from viz_estim.recording.columns import Times
 from viz_estim.recording.compared import Compared, is_figure
 from viz_estim.recording.layout import as_product
-from viz_estim.recording.plot_tabs import figure_names
+from viz_estim.recording.plot_tabs import figure_names, figures_once
 from viz_estim.recording.reader import Run
 from viz_estim.recording.sheet import Sheet, titled
 from viz_estim.recording.tables import StageTable
@@ -28,8 +28,9 @@ def draw(sheet: Sheet) -> None:
     for one in sheet.runs:
         _draw_moved(sheet, one)
     for one in sheet.runs:
-        for table in one.run.stages.values():
-            numbers = [name for name, values in table.values.items() if is_figure(name, values)]
+        tables = one.run.stages.values()
+        by_stage = {t.name: [name for name, values in t.values.items() if is_figure(name, values)] for t in tables}
+        for table, numbers in zip(tables, figures_once(by_stage).values(), strict=True):
             clouds = 0 if "particles" in one.run.properties else None
             for name, words in figure_names(numbers, fit=table.values.keys() >= FIT, particles=clouds).items():
                 at, title = sheet.times(one, table.place, table.step), f"{table.name}: {words}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import rerun.blueprint as rrb
 from rerun.encodings import TimeRange
@@ -23,7 +23,7 @@ _LANE, _LANES_HEAD = 40, 48  # pixels of a lane with its name, and of what stand
 # What the single numbers of our own stages mean, those first that say most.
 _OF_CLOUDS = {
     "evidence": "log-evidence of the reading",
-    "ess": "effective sample size",
+    "ess": "effective sample size before resampling",
     "distinct": "distinct ancestors",
 }
 _OF_FITS = {"rmse": "RMSE of the matches [m]", "count": "matches", "converged": "1 when the matches repeat"}
@@ -37,6 +37,14 @@ def figure_names(fields: list[str], *, fit: bool, particles: int | None) -> dict
     known = _OF_FITS if fit else {} if particles is None else _OF_CLOUDS
     fields = sorted(fields, key=lambda field: list(known).index(field) if field in known else len(known))
     return {f: known.get(f, f) + (f", of {particles}" if particles and f in _COUNTED else "") for f in fields}
+
+
+def figures_once(stages: dict[str, list[str]]) -> dict[str, list[str]]:
+    """By stage the single numbers to show: of a resampling not the effective sample size that it found, where the
+    weighing before it has told the same."""
+    weighed = any("ess" in fields and "distinct" not in fields for fields in stages.values())
+    twice = {"ess"} if weighed else set[str]()
+    return {s: [f for f in fields if not (f in twice and "distinct" in fields)] for s, fields in stages.items()}
 
 
 def lanes(origin: str, name: str) -> rrb.StateTimelineView:
@@ -56,6 +64,16 @@ def show_all(item: _Item, duration: float) -> _Item:
         for view in _views(item):
             if isinstance(view, rrb.TimeSeriesView):
                 view.properties["TimeAxis"] = _whole_run()
+    return item
+
+
+def show_from(item: _Item, start: float, end: float) -> _Item:
+    """The same, where plots show this part (s) of a run on the timeline `time`, and a little beside it."""
+    edge = 0.02 * (end - start)
+    part = TimeRange(*(rrb.TimeRangeBoundary.absolute(seconds=at) for at in (start - edge, end + edge)))
+    for view in _views(item):
+        if isinstance(view, rrb.TimeSeriesView):
+            view.properties["TimeAxis"] = rrb.TimeAxis(link="Independent", view_range=part)
     return item
 
 
@@ -100,20 +118,10 @@ def probabilities() -> rrb.TimeSeriesView:
 def _health(layout: Layout) -> list[_Item]:
     """Is the filter right, and does it know: errors, innovations, NIS; the innovations in a tab of their own where one
     would be crowded, and NIS with them where the errors alone crowd one."""
-    parts = [(name, part) for name, part in layout.space.parts.items() if name in layout.true_parts]
-    views: list[_Item] = [
-        _framed(layout, "error", f"{name}.{axis}", f"{titled(name, axis)} error{unit_of(part, i)}")
-        for name, part in parts
-        for i, axis in enumerate(part.axes)
-    ]
-    errors = _rows(views, [len(part.axes) for _, part in parts], most=3)
+    parts = {name: part for name, part in layout.space.parts.items() if name in layout.true_parts}
+    errors = _each(layout, "error", parts, " error", most=3)
     what = " innov." if len(layout.sensors) < 4 else ""  # four in a row leave no place for the word
-    views = [
-        _framed(layout, "innovation", f"{name}.{axis}", f"{titled(name, axis)}{what}{unit_of(space, i)}")
-        for name, space in layout.sensors.items()
-        for i, axis in enumerate(space.axes)
-    ]
-    innovations = _rows(views, [len(space.axes) for space in layout.sensors.values()])
+    innovations = _each(layout, "innovation", layout.sensors, what)
     bands: list[_Item] = []
     for name, space in layout.sensors.items():
         dof = len(space.axes)
@@ -125,6 +133,7 @@ def _health(layout: Layout) -> list[_Item]:
     if len(errors) + len(innovations) + len(nis) <= _READABLE:
         rows = [*errors, *innovations, *nis]
         return [rrb.Vertical(*rows, name=whole + bounds)] if rows else []
+    innovations = _each(layout, "innovation", layout.sensors, "")  # the tab says what they are
     if errors and len(errors) + len(nis) <= _READABLE:
         return [
             rrb.Vertical(*errors, *nis, name=whole + bounds),
@@ -132,15 +141,25 @@ def _health(layout: Layout) -> list[_Item]:
         ]
     return [
         *_in_tabs([*innovations, *nis], "Innovations" + bounds, "Innovations"),
-        *_in_tabs(errors, "Errors" + bounds, "Errors"),
+        *_in_tabs(_each(layout, "error", parts, "", most=3), "Errors" + bounds, "Errors"),
     ]
+
+
+def _each(layout: Layout, group: str, parts: Mapping[str, Space], what: str, most: int = 4) -> list[_Item]:
+    """Rows of a plot for each axis; what: the word for what is shown of it."""
+    views: list[_Item] = [
+        _framed(layout, group, f"{name}.{axis}", f"{titled(name, axis)}{what}{unit_of(part, i)}")
+        for name, part in parts.items()
+        for i, axis in enumerate(part.axes)
+    ]
+    return _rows(views, [len(part.axes) for part in parts.values()], most)
 
 
 def _figures(layout: Layout) -> list[_Item]:
     """The single numbers of stages, over time: one below the other, so that their times are."""
     views: list[_Item] = []
-    for stage, fields in layout.stages.items():
-        numbers = [field for field, what in fields.items() if what.get("shape") == []]
+    by_stage = {s: [f for f, what in fs.items() if what.get("shape") == []] for s, fs in layout.stages.items()}
+    for stage, numbers in figures_once(by_stage).items():
         named = figure_names(numbers, fit=layout.matched, particles=layout.particles or None)
         for field, words in named.items():
             top = _TOPS.get(field) if layout.matched else layout.particles if field in _COUNTED else None
@@ -261,6 +280,7 @@ def titled(name: str, axis: str) -> str:
     or where it is `state`, as what has no parts is called."""
     if axis in (name.partition("/")[0], "angle"):
         return name
+    axis = axis.removesuffix(".angle")
     return axis if name == "state" or re.fullmatch(rf"{re.escape(name)}\d+", axis) else f"{name} {axis}"
 
 

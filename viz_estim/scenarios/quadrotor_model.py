@@ -13,9 +13,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from viz_estim.core import quaternions
+from viz_estim.core.euler import EulerAngles
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick
-from viz_estim.core.spaces import SO2, SO3, Euclidean, Product, Space
+from viz_estim.core.spaces import SO3, Euclidean, Product, Space
 from viz_estim.scenarios.imu_health import GRAVITY
 
 Chart = Literal["so3", "zxy"]
@@ -110,11 +111,6 @@ def _same(q: Array) -> Array:
     return q
 
 
-def _zxy_to_quaternion(angles: Array) -> Array:
-    x, y, z = (quaternions.exp(angles[..., i, None] * np.eye(3)[i]) for i in range(3))
-    return quaternions.multiply(quaternions.multiply(z, x), y)
-
-
 def _zxy_of_quaternion(q: Array) -> Array:
     """Roll, pitch, yaw (*, 3) of R = Rz(yaw)·Rx(roll)·Ry(pitch)."""
     R = quaternions.to_matrix(q)
@@ -131,7 +127,8 @@ def _zxy_turned(angles: Array, rate: Array, turned: Array, dt: float) -> Array:
     return angles + dt * np.stack([roll_rate, pitch_rate, yaw_rate], axis=-1)
 
 
+_ZXY = EulerAngles("zxy")
 _ATTITUDES = {
     "so3": Attitude(SO3(), _same, _same, lambda attitude, rate, turned, dt: turned),
-    "zxy": Attitude(Product(roll=SO2(), pitch=SO2(), yaw=SO2()), _zxy_to_quaternion, _zxy_of_quaternion, _zxy_turned),
+    "zxy": Attitude(_ZXY, _ZXY.to_quaternion, _zxy_of_quaternion, _zxy_turned),
 }
