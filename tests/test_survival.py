@@ -69,7 +69,7 @@ def test_a_failure_is_the_recording_s_last_step(
     assert error["message"].startswith(words)
     run = viz_estim.load(out)
     assert run.complete
-    assert run.error == f"step 7, stage {where}: {error['message']}"
+    assert run.error == f"step 7, {'' if where.startswith('after') else 'in '}{where}: {error['message']}"
     assert run.properties["result"]["error"] == error
     assert [table.name for table, _ in run.at(7)] == stages
     shown = json.loads(cli("show", out, "--step", 7, "--json").out)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from viz_estim.core.run import failed_where
 from viz_estim.diagnosis import (
     clocks,
     confidence,
@@ -190,8 +189,7 @@ def _without_a_wrong_gyro_s(run: Run, found: list[Finding]) -> list[Finding]:
 def _failure(run: Run) -> list[Finding]:
     if run.error is None:
         return _no_number(run)
-    step, told = int(run.step[-1]), (run.properties.get("result") or {}).get("error")
-    where = f"step {told['step']}, {failed_where(told['stage'])}: {told['message']}" if told else run.error
+    step = int(run.step[-1])
     return [
         Finding(
             "failed",
@@ -199,7 +197,7 @@ def _failure(run: Run) -> list[Finding]:
             None,
             (step, step),
             {"message": run.error},
-            f"the filter raised at {one_line(where)}",
+            f"the filter raised at {one_line(run.error)}",
             f"`viz-estim debug FILE` opens at step {step}, with the stages that came before the failure",
         )
     ]

@@ -11,7 +11,7 @@ import numpy as np
 
 from viz_estim.core.descriptions import describe, rebuild
 from viz_estim.core.quaternions import Array
-from viz_estim.core.run import Scenario, Step
+from viz_estim.core.run import Scenario, Step, failed_where
 from viz_estim.core.scenery import Cloud
 from viz_estim.core.spaces import Space
 from viz_estim.core.stages import Innovation, Matches, SigmaPoints, Stage
@@ -56,7 +56,7 @@ def collect(scenario: Scenario, steps: Iterable[Step], params: dict[str, Any] | 
         _inputs(rows),
         tables,
         ends(index, tables, space, labels),
-        f"step {failure.step}, stage {failure.stage}: {failure.message}" if failure else None,
+        f"step {failure.step}, {failed_where(failure.stage)}: {failure.message}" if failure else None,
         True,
         {
             name: (flat3(thing.points), thing.moves)

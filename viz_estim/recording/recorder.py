@@ -17,7 +17,7 @@ import numpy as np
 import rerun as rr
 
 from viz_estim.core.descriptions import describe
-from viz_estim.core.run import Scenario, Step
+from viz_estim.core.run import Scenario, Step, failed_where
 from viz_estim.core.stages import Stage
 from viz_estim.recording import blueprints, schema
 from viz_estim.recording.batch import Batch
@@ -233,7 +233,7 @@ class Recorder:
         self._pictures.add(batch)
         self._show()
         if error := steps[-1].error:  # a failure is a run's last step
-            text = f"step {error.step}, stage {error.stage}: {error.message}"
+            text = f"step {error.step}, {failed_where(error.stage)}: {error.message}"
             last = batch.times.pick(np.array([-1]))
             at = Times(last.step, last.time, np.array([batch.end - 1]))
             send(self._stream, schema.EVENTS, at, rr.TextLog.columns(text=[text], level=["ERROR"]))
