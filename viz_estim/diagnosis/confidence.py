@@ -16,13 +16,12 @@ from viz_estim.core.distributions import chi2, norm
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis import tuning
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, Finding, judge, times
+from viz_estim.diagnosis.finding import FEWEST, GROSS, ODDS, SHEET, TINY, Finding, judge, times
 from viz_estim.diagnosis.outlying import outlying
 
 # A covariance too small by GROSS is an error, by less a warning; too large is never one: it costs, and misleads nobody.
 # S goes as the root of Q, as that of a random walk does in its steady state, P ≈ √(Q·R): Q may be wrong by its square.
 _GROSS_Q = GROSS**2
-_FEWEST = 10
 
 
 def by_sensor(case: Case, *, tune: bool) -> Iterator[Finding]:
@@ -53,7 +52,7 @@ def _by_sensor(case: Case, tune: bool) -> Iterator[Finding]:
     spoken = False
     for name, readings in case.sensors.items():
         N, dof = len(readings), readings.dof
-        if N < _FEWEST:
+        if N < FEWEST:
             continue
         ratio, p, p_gross = size(readings.nis, dof, len(case.sensors))
         if judge(p, 2 * len(case.sensors), large=False) is None:
@@ -92,7 +91,7 @@ def _by_process(case: Case) -> Iterator[Finding]:
     looks = [
         min(size(r.nis, r.dof, len(case.sensors))[1], ljung_box(r))
         for r in case.sensors.values()
-        if len(r) >= 2 * _FEWEST
+        if len(r) >= 2 * FEWEST
     ]
     if not looks or min(looks) > 0.05:
         return
@@ -133,7 +132,7 @@ def _more_noise(factor: float, of: tuning.Tuned, case: Case) -> str:
 def ljung_box(readings: Readings, lags: int = 10) -> float:
     """The chance of innovations so coloured (Ljung and Box 1978)."""
     white, N = readings.white - readings.white.mean(0), len(readings)
-    total = np.maximum((white**2).sum(0), 1e-300)
+    total = np.maximum((white**2).sum(0), TINY)
     rho = np.stack([(white[k:] * white[:-k]).sum(0) / total for k in range(1, min(lags, N // 5) + 1)])
     Q = N * (N + 2) * float((rho**2 / (N - np.arange(1, len(rho) + 1))[:, None]).sum())
     return float(chi2.sf(Q, rho.size))

@@ -9,10 +9,10 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, Euclidean, Product, Space, wrap
 from viz_estim.diagnosis.axes import explains, finding_of, maps
-from viz_estim.diagnosis.covariance import epsilon
 from viz_estim.diagnosis.evidence import Case, Readings, tells_reading
-from viz_estim.diagnosis.finding import HALF_THE_DIGITS, Finding, level
+from viz_estim.diagnosis.finding import FEWEST, HALF_THE_DIGITS, TINY, Finding, level
 from viz_estim.diagnosis.kinematics import imu_axes, scale
+from viz_estim.diagnosis.rounding import epsilon
 from viz_estim.recording.layout import leaves
 
 _TURNS = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0, "": None}  # by unit; unknown where none is told
@@ -149,19 +149,20 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         space = readings.space
         if not tells_reading(readings.predicted):
             continue
-        if told or not isinstance(space, Euclidean) or not 1 <= len(space.axes) <= 3 or len(readings) < 10:
+        if told or not isinstance(space, Euclidean) or not 1 <= len(space.axes) <= 3 or len(readings) < FEWEST:
             continue
         own = float(np.nansum(readings.nis))
         sound = np.isfinite(readings.nis) & np.isfinite(readings.z).all(1) & np.isfinite(readings.predicted).all(1)
         z, predicted, precision = readings.z[sound], readings.predicted[sound], np.linalg.inv(readings.cov[sound])
         best, what = np.inf, ""
-        for title, M in maps(len(space.axes), space.axis_units[0]):
+        tried = maps(len(space.axes), space.axis_units[0])
+        for title, M in tried:
             off = z - predicted @ np.linalg.inv(M).T
             value = float(np.einsum("ti,tij,tj->", off, precision, off))
             if value < best:
                 best, what = value, title
-        gain, explained = 0.5 * (own - best), 1 - best / max(own, 1e-300)
+        gain, explained = 0.5 * (own - best), 1 - best / max(own, TINY)
         nothing = float(np.einsum("ti,tij,tj->", z, precision, z))
-        sure = gain > -np.log(level("error", 60 * len(case.sensors)))
+        sure = gain > -np.log(level("error", len(tried) * len(case.sensors)))
         if sure and explains(what, own, best, nothing, z.size):
             yield finding_of(name, readings.steps, what, explained, gain)

@@ -9,7 +9,7 @@ import numpy as np
 from viz_estim.core.consistency import FIT
 from viz_estim.core.distributions import binom, chi2, f
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
+from viz_estim.diagnosis.finding import GROSS, TINY, Finding, judge, level
 from viz_estim.recording.tables import StageTable
 
 _HALF = 0.5  # of the cloud's points: the breakdown point, beyond which no estimate tells which half is right
@@ -121,7 +121,7 @@ def rising(case: Case) -> Iterator[Finding]:
     if fits is None or len(fits.step) < 3:
         return
     rmse, count = fits.values["rmse"].ravel(), fits.values["count"].ravel()
-    ratio, dof = np.square(rmse[1:] / np.maximum(rmse[:-1], 1e-300)), _dimensions(case) * count[1:]
+    ratio, dof = np.square(rmse[1:] / np.maximum(rmse[:-1], TINY)), _dimensions(case) * count[1:]
     by_chance = f.isf(level("warning", len(ratio)), np.maximum(dof, 1), np.maximum(dof, 1))
     rises = np.flatnonzero((ratio > by_chance) & (count[1:] <= count[:-1])) + 1
     if len(rises):

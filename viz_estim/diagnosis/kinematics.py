@@ -12,8 +12,8 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3
 from viz_estim.diagnosis.axes import explains, finding_of, maps, units
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, SOLVABLE, Finding, judge, level
-from viz_estim.diagnosis.fits import STRETCHES
+from viz_estim.diagnosis.finding import FEWEST, GROSS, ODDS, SHEET, SOLVABLE, TINY, Finding, judge, level
+from viz_estim.diagnosis.fits import STRETCHES, in_stretches
 from viz_estim.diagnosis.naming import likeliest, of_motion
 from viz_estim.diagnosis.sensors import Imu, imu
 from viz_estim.scenarios.imu_health import GRAVITY
@@ -48,14 +48,14 @@ def imu_axes(case: Case) -> Iterator[Finding]:
     of_rate, of_force = ([float(left.sum()) for left in those] for those in (left_by_rate, left_by_force))
     length = float(np.median(np.linalg.norm(both.force, axis=1)))
     least = min(*of_rate, *of_force)
-    variance = max(least, 1e-12) / change.size
+    variance = max(least, TINY) / change.size
     pushes = _dependent(min((*left_by_rate, *left_by_force), key=lambda left: float(left.sum())))
-    gain, explained = 0.5 * (own - least) / variance / pushes, 1 - least / max(own, 1e-300)
+    gain, explained = 0.5 * (own - least) / variance / pushes, 1 - least / max(own, TINY)
     nothing = float(np.square(change).sum())  # what no turn at all would leave: a map that is no better is none
     if gain > -np.log(level("error", 2 * len(candidates))):
         blamed = _blamed(case, both)
         # Another map of the other sensor, where that is as likely: their windows share pushes of the hand.
-        alike = 0.5 * change.size / pushes * np.log(min(of_force) / max(least, 1e-300)) < np.log(ODDS)
+        alike = 0.5 * change.size / pushes * np.log(min(of_force) / max(least, TINY)) < np.log(ODDS)
         if blamed == "accel" and alike:
             name, what = "accel", candidates[int(np.argmin(of_force))][0]
         else:
@@ -106,10 +106,11 @@ def _slopes(X: Array, change: Array) -> list[tuple[float, float]]:
     inverse = np.linalg.inv(A)
     s = inverse @ np.einsum("wki,wk->i", X, change)
     scores = np.einsum("wki,wk->wi", X, change - X @ s)
-    parts = np.array([part.sum(0) for part in np.array_split(scores, STRETCHES)])
-    robust = inverse @ (parts.T @ parts) @ inverse * STRETCHES / (STRETCHES - 1)
+    parts = in_stretches(scores)
+    spread = max(len(parts) - 1, 1)
+    robust = inverse @ (parts.T @ parts) @ inverse * len(parts) / spread
     error = np.sqrt(np.maximum(np.diag(robust), np.finfo(float).tiny))
-    p = 2 * t.sf(np.maximum(np.abs(s - 1) - SHEET, 0) / error, STRETCHES - 1)
+    p = 2 * t.sf(np.maximum(np.abs(s - 1) - SHEET, 0) / error, spread)
     return list(zip(s.tolist(), p.tolist(), strict=True))
 
 
@@ -119,7 +120,7 @@ def _windows(case: Case, both: Imu) -> tuple[Array, Array, Array, tuple[int, int
     time = case.run.time[both.rows]
     n = max(2, round(_WINDOW / max(float(np.median(np.diff(time))), 1e-6)))
     W = len(time) // n
-    if W < 12:
+    if W < FEWEST:
         return None
     force = both.force[: W * n].reshape(W, n, 3).mean(1)
     force = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-9)
@@ -130,7 +131,7 @@ def _windows(case: Case, both: Imu) -> tuple[Array, Array, Array, tuple[int, int
     at = case.run.step[both.rows]
     fine = np.asarray(np.array([int(step) in read for step in at[: W * n]]).reshape(W, n).all(axis=1))
     fine = fine[1:] & fine[:-1]
-    if fine.sum() < 12:
+    if fine.sum() < FEWEST:
         return None
     middle, change = 0.5 * (force[1:] + force[:-1]), force[1:] - force[:-1]
     return turn[fine], middle[fine], change[fine], (int(at[0]), int(at[-1]))
@@ -145,7 +146,7 @@ def _dependent(left: Array) -> float:
     """How many windows share one push of the hand: 1 + 2·Σρₖ of the squares (W,) that are left, up to the first
     ρₖ ≤ 0 (Geyer 1992)."""
     about = left - left.mean()
-    rho = np.correlate(about, about, "full")[len(left) - 1 :] / max(float(about @ about), 1e-300)
+    rho = np.correlate(about, about, "full")[len(left) - 1 :] / max(float(about @ about), TINY)
     return float(1 + 2 * rho[1 : int(np.argmax(rho <= 0))].sum()) if (rho <= 0).any() else float(len(left))
 
 
@@ -160,7 +161,7 @@ def _blamed(case: Case, both: Imu) -> str:
                 up = quaternions.rotate(quaternions.conjugate(truth[known]), _UP)
                 seen = both.force[known] / np.linalg.norm(both.force[known], axis=1, keepdims=True)
                 return _upright(seen.T @ up / len(up))
-    level_at_rest = both.force[: max(1, len(both.force) // 20)].mean(0)
+    level_at_rest = both.force[: max(1, len(both.force) // STRETCHES)].mean(0)
     return _upright(np.outer(level_at_rest / np.linalg.norm(level_at_rest), _UP))
 
 

@@ -8,12 +8,11 @@ import numpy as np
 
 from viz_estim.core.distributions import binom
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.finding import Finding, judge
+from viz_estim.diagnosis.finding import FEWEST, Finding, judge
 from viz_estim.diagnosis.sensors import continuous, given, runs
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.reader import Run
 
-_FEWEST = 10  # of readings of 52 bits: by then they are the same in all but name
 _HELD = "a reading is held and given again until the next one comes"
 
 
@@ -69,7 +68,7 @@ def one_for_two(run: Run) -> Iterator[Finding]:
     for k, (name, values) in enumerate(columns):
         for other, others in columns[:k]:
             both = np.flatnonzero(np.isfinite(values) & np.isfinite(others))
-            if len(both) >= _FEWEST and (values[both] == others[both]).all():
+            if len(both) >= FEWEST and (values[both] == others[both]).all():
                 yield Finding(
                     "used_twice", "error", name.partition("/")[0].partition(" ")[0],
                     (int(run.step[both[0]]), int(run.step[both[-1]])), {"times": len(both), "of": [other, name]},

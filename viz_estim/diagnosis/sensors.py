@@ -9,7 +9,7 @@ import numpy as np
 
 from viz_estim.core.distributions import binom, chi2, norm, t
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, judge, level
+from viz_estim.diagnosis.finding import FEWEST, GROSS, SHEET, TINY, Finding, judge, level
 from viz_estim.recording.reader import Run
 from viz_estim.scenarios.imu_health import DRIFT, GRAVITY, frozen_accel, frozen_gyro, still_prefix
 
@@ -53,7 +53,7 @@ def imu(run: Run) -> Imu | None:
     if force is None or rate is None or force.shape[1:] != (3,) or rate.shape[1:] != (3,):
         return None
     rows = np.flatnonzero(np.isfinite(force).all(1) & np.isfinite(rate).all(1))
-    if len(rows) < 20:
+    if len(rows) < FEWEST:
         return None
     length = np.median(np.linalg.norm(force[rows], axis=1))
     return Imu(rows, rate[rows], force[rows] * (GRAVITY if abs(length - 1) < SHEET else 1.0))
@@ -134,7 +134,7 @@ def silent(run: Run) -> Iterator[Finding]:
     """
     sensors = given(run)
     for name, (rows, _) in sensors.items():
-        if len(rows) < 10:
+        if len(rows) < FEWEST:
             continue
         gaps = np.diff(np.append(rows, len(run.step)))  # up to the run's end: there it is silent for good
         usual, N = float(np.median(gaps)), len(gaps)
@@ -177,7 +177,7 @@ def saturated(run: Run, without: Sequence[tuple[int, int]] = ()) -> Iterator[Fin
             for sign, end in ((1, "largest"), (-1, "smallest")):
                 x = sign * values[:, i]
                 distinct = np.unique(x)
-                if len(distinct) < 20:
+                if len(distinct) < FEWEST:
                     continue
                 top = x == distinct[-1]
                 near = (x >= distinct[-1] - _quantum(distinct) * 1.5) | top
@@ -217,11 +217,11 @@ def biased_at_rest(run: Run) -> Iterator[Finding]:
     if both is None:
         return
     still = still_prefix(run.time[both.rows], both.rate, both.force) // 2
-    if still < 20:
+    if still < FEWEST:
         return
     rest = both.rate[:still]
     about = rest - rest.mean(0)
-    rho = (about[1:] * about[:-1]).sum(0) / np.maximum((about**2).sum(0), 1e-300)
+    rho = (about[1:] * about[:-1]).sum(0) / np.maximum((about**2).sum(0), TINY)
     fast = np.abs(rest.mean(0)).max() > DRIFT[0] and not _belied(both, rest.mean(0), run, still)
     if (np.abs(rho) > norm.isf(level("warning", 6)) / np.sqrt(still)).any() or fast:
         return  # readings that follow one another, or too large: it turns, however slowly
@@ -264,7 +264,7 @@ def runs(flags: np.ndarray) -> list[tuple[int, int]]:
 def _quantum(distinct: Array) -> float:
     """The smallest step between a component's sorted distinct values."""
     steps = np.diff(distinct)
-    steps = steps[steps > 1e-9 * max(np.ptp(distinct), 1e-300)]
+    steps = steps[steps > 1e-9 * max(np.ptp(distinct), TINY)]
     return float(steps.min()) if len(steps) else 0.0
 
 

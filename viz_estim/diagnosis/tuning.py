@@ -17,7 +17,9 @@ import scipy
 from viz_estim.core.distributions import chi2
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
-from viz_estim.diagnosis.evidence import Case, jacobians, once, tells_gain, transitions
+from viz_estim.diagnosis.evidence import Case, once, tells_gain
+from viz_estim.diagnosis.finding import LARGEST
+from viz_estim.diagnosis.linear import jacobians, transitions
 from viz_estim.diagnosis.outlying import outlying
 from viz_estim.recording.tables import StageTable
 
@@ -53,7 +55,7 @@ class Tuned(NamedTuple):
         fine, values = _spline(self.scores, self.grid)
         if not fine[0] <= np.log(factor) <= fine[-1]:
             return np.inf
-        return float(np.exp(min(values.max() - values[np.searchsorted(fine, np.log(factor))], 700.0)))
+        return float(np.exp(min(values.max() - values[np.searchsorted(fine, np.log(factor))], LARGEST)))
 
 
 class _Turned(NamedTuple):
@@ -229,7 +231,7 @@ def _scores(case: Case, model: _Model, scale: dict[str, Array], B: int) -> Array
 
 def _turned(case: Case, table: StageTable, before: Array) -> _Turned:
     get = table.values
-    H, residual = jacobians(before, get["innovation.cross_cov"]).copy(), get["innovation.residual"].copy()
+    H, residual = jacobians(case, table).copy(), get["innovation.residual"].copy()
     noise, on, sensors = np.empty_like(residual), np.zeros(residual.shape, bool), []
     steps = {name: r.step[~outlying(r.nis, r.dof, len(case.sensors)).far] for name, r in case.sensors.items()}
     for i, (part, axes) in enumerate(_parts(table).items()):
