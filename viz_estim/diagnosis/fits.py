@@ -100,9 +100,13 @@ def _chance(off: float, error: Array, dof: tuple[float, float]) -> Chance:
 
 
 def fitted(one: Against, design: Array) -> Fitted:
-    """r (M, m) on a design (M, m, k) by least squares in R; explained: the share of Σ|r|² beyond what noise may be, its
-    χ² quantile at a warning's level."""
-    X, y = white(one, design), white(one, one.r)
+    """r (M, m) on a design (M, m, k) by least squares in R."""
+    return least_squares(white(one, design), white(one, one.r), 1.0)
+
+
+def least_squares(X: Array, y: Array, variance: float = 0.0) -> Fitted:
+    """y (M, m) on X (M, m, k), whose noise has this variance at least; explained: the share of Σ|y|² beyond what such
+    noise may be, its χ² quantile at a warning's level. Zeros where X does not tell all coefficients."""
     M, m, k = X.shape
     A = np.einsum("tmi,tmj->ij", X, X)
     if not np.isfinite(A).all() or np.linalg.matrix_rank(A) < k:
@@ -112,10 +116,10 @@ def fitted(one: Against, design: Array) -> Fitted:
     left = y - X @ beta
     pieces = in_stretches(np.einsum("tmi,tm->ti", X, left)) @ inverse
     spread = max(len(pieces) - 1, 1)
-    model = np.diag(inverse) * max(1.0, float((left**2).mean()))
+    model = np.diag(inverse) * max(variance, float((left**2).mean()))
     error = np.sqrt([model, np.square(pieces).sum(0) * len(pieces) / spread])
     own, rest = float((y**2).sum()), float((left**2).sum())
-    noise = float(chi2.isf(level("warning", 1), M * m))
+    noise = variance * float(chi2.isf(level("warning", 1), M * m))
     # In the least variance that explains the rest, so that an R that is too small does not count for a cause.
     gain = 0.5 * M * m * np.log(own / max(rest, TINY))
     return Fitted(beta, error, (M - k, spread), gain, (own - rest) / max(own - min(noise, rest), TINY))

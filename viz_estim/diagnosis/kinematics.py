@@ -7,13 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from viz_estim.core import quaternions
-from viz_estim.core.distributions import t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3
 from viz_estim.diagnosis.axes import explains, finding_of, maps, units
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import FEWEST, GROSS, ODDS, SHEET, SOLVABLE, TINY, Finding, judge, level
-from viz_estim.diagnosis.fits import STRETCHES, in_stretches
+from viz_estim.diagnosis.finding import FEWEST, GROSS, ODDS, SHEET, TINY, Finding, judge, level
+from viz_estim.diagnosis.fits import STRETCHES, least_squares
 from viz_estim.diagnosis.naming import likeliest, of_motion
 from viz_estim.diagnosis.sensors import Imu, imu
 from viz_estim.scenarios.imu_health import GRAVITY
@@ -71,7 +70,7 @@ def imu_axes(case: Case) -> Iterator[Finding]:
 def scale(case: Case) -> Iterator[Finding]:
     """ġ = −(s∘ω) × g: the factor s of each axis of the gyro, or of all three, by least squares over the windows.
 
-    Errors of its variance by 20 stretches of the run (Liang and Zeger 1986), so that a push of the hand counts once.
+    Its errors by stretches of the run too, so that a push of the hand counts once.
     Told where s is further from 1 than 5 %, by a t-test against that: what a data sheet leaves to a calibration.
     """
     both = imu(case.run)
@@ -80,38 +79,20 @@ def scale(case: Case) -> Iterator[Finding]:
         return
     turn, middle, change, steps = pieces
     axes = np.stack([-np.cross(turn[:, [i]] * np.eye(3)[i], middle) for i in range(3)], axis=-1)  # (W, 3, 3)
-    found = [one for X in (axes.sum(-1, keepdims=True), axes) for one in _slopes(X, change)]
-    if not found:
-        return
-    s, p = min(found, key=lambda one: one[1])
+    fits = [least_squares(X, change - X.sum(-1)) for X in (axes.sum(-1, keepdims=True), axes)]  # on s − 1
+    found = [(1 + float(s), fit.p(i, SHEET)) for fit in fits for i, s in enumerate(fit.coefficients)]
+    k, (s, p) = min(enumerate(found), key=lambda one: max(one[1][1]))
     severity = judge(p, len(found), large=True)
     if severity and s > 0:
-        k = next(k for k, one in enumerate(found) if one[1] == p)
         which = "gyro" if k == 0 else f"gyro's {'xyz'[k - 1]}"
         names = likeliest(1 / s, of_motion("rad", 0.0))
         as_if = f": {', or '.join(names)}" if names else ": its sensitivity is another one"
         yield Finding(
             "units_or_axes", severity, "gyro", steps,
-            {"map": f"a factor of {1 / s:.3g}", "p": p, "factors": [1 / one[0] for one in found]},
+            {"map": f"a factor of {1 / s:.3g}", "p": max(p), "factors": [1 / one[0] for one in found]},
             f"the {which} reads {1 / s:.3g}× the turn that gravity shows{as_if}",
             f"divide the {which} by {1 / s:.3g}, or calibrate it (`viz-estim calibrate imu`)",
         )  # fmt: skip
-
-
-def _slopes(X: Array, change: Array) -> list[tuple[float, float]]:
-    """The coefficients of change (W, 3) on X (W, 3, k), and the p of each if it is 5 % off 1 at most."""
-    A = np.einsum("wki,wkj->ij", X, X)
-    if not np.isfinite(A).all() or np.linalg.cond(A) > SOLVABLE:
-        return []
-    inverse = np.linalg.inv(A)
-    s = inverse @ np.einsum("wki,wk->i", X, change)
-    scores = np.einsum("wki,wk->wi", X, change - X @ s)
-    parts = in_stretches(scores)
-    spread = max(len(parts) - 1, 1)
-    robust = inverse @ (parts.T @ parts) @ inverse * len(parts) / spread
-    error = np.sqrt(np.maximum(np.diag(robust), np.finfo(float).tiny))
-    p = 2 * t.sf(np.maximum(np.abs(s - 1) - SHEET, 0) / error, spread)
-    return list(zip(s.tolist(), p.tolist(), strict=True))
 
 
 def _windows(case: Case, both: Imu) -> tuple[Array, Array, Array, tuple[int, int]] | None:
