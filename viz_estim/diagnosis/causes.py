@@ -13,12 +13,11 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean
 from viz_estim.diagnosis.axes import TRIED, explains, maps
-from viz_estim.diagnosis.finding import TINY, Chance, by_ratio, level
+from viz_estim.diagnosis.finding import TINY, WINDOW, Chance, by_ratio, level
 from viz_estim.diagnosis.fits import Against, Fitted, fitted, white
 from viz_estim.diagnosis.linear import straight
 from viz_estim.diagnosis.naming import named, of_reading
 
-_SPAN = 0.1  # s over which a rate is taken at least: noise of the truth would hide it in a shorter one
 _SQUARE = "squares"
 
 
@@ -92,7 +91,7 @@ def lag(one: Against, interval: float) -> Iterator[Cause]:
     """r = −τ·ż + constant, ż the rate of what the truth would give, by central differences."""
     if len(one.time) < 3 or (np.diff(one.time) <= 0).any():
         return
-    k = min(max(1, round(0.5 * _SPAN / float(np.median(np.diff(one.time))))), (len(one.time) - 1) // 2)
+    k = min(max(1, round(0.5 * WINDOW / float(np.median(np.diff(one.time))))), (len(one.time) - 1) // 2)
     span = (one.time[2 * k :] - one.time[: -2 * k])[:, None]
     rate = one.space.minus(one.true[2 * k :], one.true[: -2 * k]) / span
     middle = one.pick(slice(k, -k))

@@ -15,10 +15,8 @@ from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, SO2, SO3, wrap
 from viz_estim.diagnosis.durations import by_biases, whole
-from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.evidence import Case, once
 from viz_estim.diagnosis.finding import EXPLAINED, FEWEST, level
-
-WINDOW = 0.1  # s
 
 
 class Moves(NamedTuple):
@@ -31,6 +29,10 @@ class Moves(NamedTuple):
 
 def moves(case: Case) -> Moves | None:
     """Of a planar robot's particles; None where there are none, or no truth."""
+    return once(case, "_moves", _moves)
+
+
+def _moves(case: Case) -> Moves | None:
     run = case.run
     found = [t for t in run.stages.values() if "states" in t.values and t.name != "start"]
     found = [t for t in found if not {"ancestors", "log_likelihoods"} & t.values.keys()]

@@ -153,6 +153,7 @@ def bounds(case: Case) -> Iterator[Finding]:
     rows = np.flatnonzero((run.step >= case.first) & np.isfinite(run.cov).all((1, 2)))
     if len(rows) < FEWEST:
         return
+    # Five ends of four eighths: more of them ask for more, and no chance is in it.
     ends = rows[np.linspace(len(rows) // 2, len(rows) - 1, 5).astype(int)]
     elapsed = run.time[ends] - run.time[rows[0]]
     if not (np.diff(elapsed) > 0).all():
@@ -229,7 +230,7 @@ def unobservable(case: Case) -> Iterator[Finding]:
             total = float(gained.sum())
             if total > np.log1p(np.sqrt(2 / rows.sum())):
                 at = table.step[rows]
-                first = int(at[np.argmax(np.cumsum(gained) > 0.1 * total)])
+                first = int(at[np.argmax(np.cumsum(gained) > 0.1 * total)])  # about where it begins
                 evidence = {"information_factor": float(np.exp(min(total, LARGEST))), "updates": int(rows.sum())}
                 yield Finding(
                     "unobservable_update", "error" if total > np.log(GROSS) else "warning", name,

@@ -143,7 +143,7 @@ def by_part(case: Case) -> Iterator[Finding]:
 def _too_sure(case: Case, name: str) -> tuple[str, str]:
     """Why a part's error may be larger than its covariance, and what to try, by the kind of estimator."""
     if case.run.properties.get("belief") == "Particles":
-        if clouds.moves(case) is not None and not list(motion.prediction(case)):
+        if clouds.moves(case) is not None and not motion.predictions(case):
             return (
                 "each step moves the particles as the truth moves, so that the readings pull the cloud away, or it is "
                 "too narrow: too few particles, or noises that are too small",

@@ -77,12 +77,15 @@ SHEET = 0.05  # of a factor: what a gyro's or a wheel's data sheet leaves to a c
 HALF_THE_DIGITS = float(np.sqrt(np.finfo(float).eps))  # what is beyond is no rounding that piled up
 SOLVABLE = SHEET / (8 * float(np.finfo(float).eps))  # the condition κ by which a solve loses 8·ε·κ (Higham 2002, 7.2)
 ODDS = 20.0  # by which one cause must be likelier than another to be named alone: strong (Kass and Raftery 1995)
-_FAMILIES = 36  # statistical checks: each has an equal share, and shares it out among what it tests
+_FAMILIES = 40  # statistical checks, rounded up: each has an equal share, and shares it out among what it tests
 # Readings: as many as the plainest test, that of signs, needs for an error's share, 2⁻ⁿ. Of fewer no test tells much;
 # it silences checks, and no alarm comes of it.
 FEWEST = int(np.ceil(np.log2(_FAMILIES / _BUDGET["error"])))
 REPEATED = 3  # times that something without chance in it must be seen, so that a single odd one is not the middle
 MOST = 40  # parts of one sensor, or faults at once, that are looked at: of more it costs much and tells the same
+# s over which a rate of motion is taken at least: in a shorter time noise of the truth or of an IMU would hide it, in a
+# longer one a hand turns round. It decides no rate: windows are held against how they scatter themselves.
+WINDOW = 0.1
 TINY = 1e-300  # stands for 0 below a line, and is no threshold: its ratio to any number can still be told
 LARGEST = float(np.log(np.finfo(float).max))  # logarithm of which there is a number
 

@@ -16,10 +16,9 @@ from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3, Euclidean
 from viz_estim.diagnosis.axes import maps
-from viz_estim.diagnosis.clouds import WINDOW
 from viz_estim.diagnosis.durations import by_biases, whole
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import EXPLAINED, FEWEST, ODDS, TINY, Finding, by_ratio, judge
+from viz_estim.diagnosis.finding import EXPLAINED, FEWEST, ODDS, TINY, WINDOW, Finding, by_ratio, judge
 from viz_estim.scenarios.imu_health import GRAVITY
 
 _UP = np.array([0.0, 0.0, GRAVITY])

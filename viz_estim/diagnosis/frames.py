@@ -10,8 +10,10 @@ from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3, Euclidean
 from viz_estim.diagnosis.causes import Cause, listed
-from viz_estim.diagnosis.finding import GROSS, TINY, by_ratio
+from viz_estim.diagnosis.finding import EXPLAINED, GROSS, HALF_THE_DIGITS, TINY, by_ratio
 from viz_estim.diagnosis.fits import Against, white
+
+_ROUNDS = 10  # of a search whose steps are squared each time; what is found is held against all readings
 
 
 def turned(one: Against) -> Iterator[Cause]:
@@ -94,7 +96,7 @@ def exchanged(one: Against, others: list[Against]) -> Iterator[Cause]:
             continue
         # Between its own readings what the other would read is a smooth curve: a line from one to the next.
         inside = (one.time >= other.time[0]) & (one.time <= other.time[-1])
-        if inside.mean() < 0.5:
+        if inside.mean() < EXPLAINED:  # else it could not explain so much
             continue
         should = np.stack([np.interp(one.time, other.time, y) for y in other.true.T], axis=-1)
         left = float((white(one, one.z - should)[inside] ** 2).sum()) / inside.mean()
@@ -138,10 +140,14 @@ def misplaced(one: Against) -> Iterator[Cause]:
 
 def place_of(position: Array, distance: Array, place: Array) -> Array:
     """Where distances (M,) to positions (M, d) come from, by Gauss and Newton from a first place (d,) on."""
-    for _ in range(10):
+    for _ in range(_ROUNDS):
         away = place - position
-        length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
-        place = place + np.linalg.lstsq(away / length[:, None], distance - length, rcond=1e-6)[0]
+        length = np.maximum(np.linalg.norm(away, axis=1), TINY)
+        to = away / length[:, None]
+        step = np.linalg.lstsq(to, distance - length, rcond=HALF_THE_DIGITS)[0]
+        place = place + step
+        if np.abs(step).max() < HALF_THE_DIGITS * np.abs(away).max():
+            break
     return place
 
 
@@ -175,6 +181,6 @@ def _angle(R: Array) -> tuple[float, str]:
     angle = float(np.linalg.norm(turn))
     axis = turn / max(angle, TINY)
     near = int(np.argmax(np.abs(axis)))
-    if abs(axis[near]) > np.cos(np.radians(10)):
+    if abs(axis[near]) > np.cos(np.radians(10)):  # in words: about one axis, to ten degrees
         return angle * float(np.sign(axis[near])), "xyz"[near]
     return angle, f"({', '.join(f'{v:.2f}' for v in axis)})"

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from viz_estim.core.distributions import norm
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, Euclidean, Product, Space, wrap
 from viz_estim.diagnosis.axes import explains, finding_of, maps
@@ -46,11 +47,12 @@ def _by_a_turn(readings: Readings, i: int) -> set[int]:
     what S allows, while reading and expectation are both angles of the first turn: a jump that no noise makes."""
     if not isinstance(readings.space, Euclidean) or readings.z.shape != readings.residual.shape:
         return set()
-    jump, sigma = np.abs(readings.residual[:, i]), np.sqrt(readings.cov[:, i, i])
+    jump = np.abs(readings.residual[:, i])
+    noise = norm.isf(level("error", len(jump))) * np.sqrt(readings.cov[:, i, i])  # none is larger, at an error's share
     for turn in (2 * np.pi, 360.0):
-        half = 0.5 * turn + 4 * sigma
+        half = 0.5 * turn + noise
         angles = (np.abs(readings.z[:, i]) < half) & (np.abs(readings.predicted[:, i]) < half)
-        rows = (np.abs(jump - turn) < 4 * sigma) & (16 * sigma < turn) & angles
+        rows = (np.abs(jump - turn) < noise) & (4 * noise < turn) & angles
         if rows.any() and (np.abs(readings.z[:, i]).max() < half.max()):
             return set(readings.step[rows].tolist())
     return set()

@@ -11,7 +11,7 @@ from viz_estim.core.consistency import nees
 from viz_estim.core.distributions import chi2, f, norm, t
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import FEWEST, GROSS, TINY, Finding, judge, level
+from viz_estim.diagnosis.finding import FEWEST, GROSS, REPEATED, TINY, Finding, judge, level
 from viz_estim.diagnosis.fits import STRETCHES, in_stretches
 from viz_estim.diagnosis.icp import is_registration
 from viz_estim.diagnosis.outlying import TAIL, outlying
@@ -77,13 +77,9 @@ def coloured(case: Case) -> Iterator[Finding]:
     """
     for name, readings in case.sensors.items():
         N = len(readings)
-        lags = min(_LAGS, N // 5)
         if N < FEWEST:
             continue
-        white = readings.white - readings.white.mean(0)
-        rho = _autocorrelations(white, lags)
-        Q = N * (N + 2) * float((rho**2 / (N - np.arange(1, lags + 1))).sum())
-        p = float(chi2.sf(Q, rho.size))
+        Q, p, rho = ljung_box(readings)
         component, lag = np.unravel_index(np.argmax(np.abs(rho)), rho.shape)
         strongest = float(rho[component, lag])
         beyond = np.arctanh(min(abs(strongest), 1 - np.finfo(float).eps)) - np.arctanh(_CORRELATED)
@@ -99,6 +95,16 @@ def coloured(case: Case) -> Iterator[Finding]:
                 evidence,
                 *_colour(name, strongest, seconds, float(np.median(readings.nis)) < chi2.median(readings.dof)),
             )
+
+
+def ljung_box(readings: Readings) -> tuple[float, float, Array]:
+    """Q of the whitened innovations, the chance of it, and their autocorrelations (m, lags). The number of lags changes
+    the power and no rate: Q is χ²(lags·m) for any."""
+    N, white = len(readings), readings.white - readings.white.mean(0)
+    lags = min(_LAGS, N // 5)
+    rho = _autocorrelations(white, lags)
+    Q = N * (N + 2) * float((rho**2 / (N - np.arange(1, lags + 1))).sum())
+    return Q, float(chi2.sf(Q, rho.size)), rho
 
 
 def _colour(name: str, strongest: float, seconds: float, small: bool) -> tuple[str, str]:
@@ -174,26 +180,25 @@ def gate_name(case: Case, name: str) -> str:
 def diverged(case: Case) -> Iterator[Finding]:
     """NIS leaves for good: from some step on every block of readings lies above its χ² band, after some that did not.
 
-    A block's sum is χ²(B·dof); a row of n such blocks at the level α each has the probability αⁿ. By then innovations
-    are twice as large, and NIS larger than before by a factor that is beyond GROSS for sure, by F.
+    A block's sum is χ²(B·dof); a row of n such blocks at the level TAIL each has the probability TAILⁿ. By then
+    innovations are twice as large, and NIS larger than before by a factor that is beyond GROSS for sure, by F.
     """
     for name, readings in case.sensors.items():
         block, blocks = _blocks(readings)
-        if blocks < 6:
+        if len(readings) < FEWEST:
             continue
-        alpha = 1e-3
         sums = readings.nis[-block * blocks :].reshape(blocks, block).sum(1)
-        high = sums > chi2.isf(alpha, block * readings.dof)
+        high = sums > chi2.isf(TAIL, block * readings.dof)
         low = np.flatnonzero(~high)
         start = int(low[-1]) + 1 if len(low) else 0
         row = blocks - start
         growth = float(sums[start:].mean() / max(sums[:start].mean(), TINY)) if 0 < start < blocks else 0.0
-        if row < 3 or growth < GROSS**2:
+        if growth < GROSS**2:
             continue
         n = block * readings.dof
         at = len(readings) - block * (blocks - start)
         p_large = float(f.sf(growth / GROSS, n * row, n * start))
-        severity = judge(blocks * alpha**row, len(case.sensors), large=p_large)
+        severity = judge(blocks * TAIL**row, len(case.sensors), large=p_large)
         if severity:
             steps = int(readings.step[at]), int(readings.step[-1])
             evidence = {"onset_step": steps[0], "onset_s": float(readings.time[at]), "growth": growth}
@@ -216,7 +221,7 @@ def lost(case: Case) -> Iterator[Finding]:
     """The error leaves for good: from some step to the end every NEES is beyond χ²'s quantile of an error's level.
 
     Whatever came before, that takes the last step to be beyond it, which chance does with that level. An error where
-    it doubles the mean NEES of the whole run; no finding where it is shorter than a twentieth of it, for a run may end
+    it doubles the mean NEES of the whole run; no finding where it is shorter than one of STRETCHES, for a run may end
     anywhere.
     """
     run = case.run
@@ -229,7 +234,7 @@ def lost(case: Case) -> Iterator[Finding]:
     inside = np.flatnonzero(values[rows] <= chi2.isf(level("error", 1), dof))
     start = int(inside[-1]) + 1 if len(inside) else 0
     lasting = len(rows) - start
-    if lasting < max(3, len(rows) // 20):
+    if lasting < max(REPEATED, len(rows) // STRETCHES):
         return
     large = float((values[rows[start:]] - dof).sum()) > (GROSS - 1) * dof * len(rows)
     steps = int(run.step[rows[start]]), int(run.step[rows[-1]])

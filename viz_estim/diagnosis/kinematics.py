@@ -11,13 +11,12 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3
 from viz_estim.diagnosis.axes import explains, finding_of, maps, units
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import FEWEST, GROSS, ODDS, SHEET, TINY, Finding, judge, level
+from viz_estim.diagnosis.finding import FEWEST, GROSS, ODDS, SHEET, TINY, WINDOW, Finding, judge, level
 from viz_estim.diagnosis.fits import STRETCHES, least_squares
 from viz_estim.diagnosis.naming import likeliest, of_motion
 from viz_estim.diagnosis.sensors import Imu, imu
 from viz_estim.scenarios.imu_health import GRAVITY
 
-_WINDOW = 0.1  # s over which gravity's turn is compared with the gyro's
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -99,7 +98,7 @@ def _windows(case: Case, both: Imu) -> tuple[Array, Array, Array, tuple[int, int
     """By window: the gyro's turn (W, 3) rad, gravity's unit direction (W, 3) and its change (W, 3); frozen times are
     left out, as the readings of the filter's sensors are."""
     time = case.run.time[both.rows]
-    n = max(2, round(_WINDOW / max(float(np.median(np.diff(time))), 1e-6)))
+    n = max(2, round(WINDOW / max(float(np.median(np.diff(time))), 1e-6)))
     W = len(time) // n
     if W < FEWEST:
         return None

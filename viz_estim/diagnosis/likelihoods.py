@@ -24,6 +24,7 @@ from viz_estim.diagnosis.rounding import epsilon
 from viz_estim.recording.layout import leaves
 from viz_estim.recording.tables import StageTable
 
+# How far is searched: what is found must give all likelihoods to rounding, which no other model does by chance.
 _STEPS, _PARTICLES = 12, 80  # that the model is fitted to
 _STARTS, _ROUNDS = 24, 60
 

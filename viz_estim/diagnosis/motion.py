@@ -13,7 +13,7 @@ from viz_estim.diagnosis import clouds, forces
 from viz_estim.diagnosis.against import slip as bound
 from viz_estim.diagnosis.axes import maps
 from viz_estim.diagnosis.durations import composed, whole
-from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.evidence import Case, once
 from viz_estim.diagnosis.finding import (
     EXPLAINED,
     FEWEST,
@@ -22,6 +22,7 @@ from viz_estim.diagnosis.finding import (
     ODDS,
     SHEET,
     TINY,
+    WINDOW,
     Chance,
     Finding,
     by_ratio,
@@ -33,6 +34,11 @@ from viz_estim.diagnosis.naming import likeliest, named, of_motion
 from viz_estim.scenarios.imu_health import GRAVITY
 
 _WORLD = "the world's axes"
+
+
+def predictions(case: Case) -> list[Finding]:
+    """What `prediction` finds, once for whoever asks."""
+    return once(case, "_motion", lambda case: list(prediction(case)))
 
 
 def prediction(case: Case) -> Iterator[Finding]:
@@ -108,7 +114,7 @@ def _by_estimate(finding: Finding) -> Finding:
 
 def _turned(case: Case) -> Iterator[Finding]:
     """An attitude that is turned by other axes or units, or about the world's axes: step by step, or by window."""
-    for window in (0.0, clouds.WINDOW):
+    for window in (0.0, WINDOW):
         if (found := clouds.turns_of_means(case, window)) is not None:
             name, (of, truly, told), in_world = found
             if (finding := _turns_as(name, truly, told, of, in_world)) is not None:
@@ -118,7 +124,7 @@ def _turned(case: Case) -> Iterator[Finding]:
 
 def _elsewhere(case: Case) -> Iterator[Finding]:
     """The same in the body's axes, also of an estimate that has gone far from the truth."""
-    if (found := clouds.turns_of_means(case, clouds.WINDOW)) is not None:
+    if (found := clouds.turns_of_means(case, WINDOW)) is not None:
         name, (of, truly, told), _ = found
         one, none = np.ones(len(of)), np.zeros(len(of))  # by window, which are all as long
         told_of: list[tuple[float, Finding]] = []

@@ -20,7 +20,7 @@ from viz_estim.core.spaces import S2, SE2, SO2, SO3, Euclidean, Product, Space
 from viz_estim.diagnosis.finding import HALF_THE_DIGITS, TINY
 from viz_estim.recording.layout import leaves
 
-_ROWS = 3  # pairs for each number of a fit, at least
+_ROWS = 3  # pairs for each number of a fit, at least: two of each are left to belie it, and none does by `exact`
 
 
 class Recovered(NamedTuple):

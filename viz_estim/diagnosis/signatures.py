@@ -26,7 +26,9 @@ from viz_estim.diagnosis.linear import jacobians, straight, transitions
 from viz_estim.diagnosis.rounding import sound
 from viz_estim.recording.tables import StageTable
 
-_BACK = 3  # readings over which a rate of change is taken: backwards, so that it is known before the innovation
+# Readings over which a rate of change is taken: backwards, so that it is known before the innovation, which is white to
+# it however many they are.
+_BACK = 3
 
 
 class Fault(NamedTuple):

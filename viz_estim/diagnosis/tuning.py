@@ -23,6 +23,7 @@ from viz_estim.diagnosis.linear import jacobians, transitions
 from viz_estim.diagnosis.outlying import outlying
 from viz_estim.recording.tables import StageTable
 
+# How finely and how far is looked; a factor at the end of it is not told as one.
 _GRID = np.arange(-6.0, 6.5) * np.log(10) / 2  # log factors, 10⁻³ to 10³
 _PLACES = 4000  # stages at most, from the first that counts on: of a thousand readings a factor is known to 5 %
 
@@ -64,7 +65,8 @@ class _Turned(NamedTuple):
     H: Array  # (M, m, d)
     residual: Array  # (M, m)
     noise: Array  # (M, m), variances
-    on: np.ndarray  # (M, m), whether the reading was used and is no outlier
+    on: list[list[int]]  # by row those of the m whose reading was used and is no outlier, and whose model is known
+    moved: Array  # (M, d, 1), K·ν
     sensors: list[str]  # m
 
 
@@ -205,12 +207,9 @@ def _scores(case: Case, model: _Model, scale: dict[str, Array], B: int) -> Array
             F = model.moves[name][row]
             x, P = F @ x, _mapped(P, F) + model.noise[name][row][:, :, None] * scale["Q"]
         elif name in model.updates and P is not None:
-            nu, K = table.values["innovation.residual"][row], table.values["gain"][row]
             readings = model.turned[name]
-            on = np.flatnonzero(readings.on[row])
-            if len(on) and np.isfinite(readings.H[row]).all() and np.isfinite(nu).all():
+            if on := readings.on[row]:
                 v, S = np.empty((2, len(on), B))
-                x, P = x.copy(), P.copy()
                 for k, i in enumerate(on):
                     h = readings.H[row, i]
                     C = (h @ P.reshape(d, d * B)).reshape(d, B)
@@ -220,7 +219,7 @@ def _scores(case: Case, model: _Model, scale: dict[str, Array], B: int) -> Array
                     x += gain * v[k]
                     P -= gain[:, None] * C
                 score -= 0.5 * (v * v / S + np.log(S)).sum(0)
-            x = x - (np.nan_to_num(K) @ np.nan_to_num(nu))[:, None]
+            x -= readings.moved[row]
             if not space.flat:
                 T = model.carried[name][row]
                 x, P = T @ x, _mapped(P, T)
@@ -245,7 +244,10 @@ def _turned(case: Case, table: StageTable, before: Array) -> _Turned:
         # As with a gate: an outlier that moved the estimate would make what comes after it a matter of Q.
         known = np.isin(table.step, steps.get(sensor, ()))
         on[:, axes] = (get["innovation.offered"][:, i] * get["innovation.used"][:, i] * known > 0)[:, None]
-    return _Turned(H, residual, noise, on, sensors)
+    nu = get["innovation.residual"]
+    on &= (np.isfinite(H).all((1, 2)) & np.isfinite(nu).all(1))[:, None]
+    moved = np.nan_to_num(get["gain"]) @ np.nan_to_num(nu)[..., None]
+    return _Turned(H, residual, noise, [np.flatnonzero(row).tolist() for row in on], moved, sensors)
 
 
 def _mapped(P: Array, A: Array) -> Array:
