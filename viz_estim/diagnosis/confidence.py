@@ -11,14 +11,15 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
-from viz_estim.core.consistency import squared_distance
 from viz_estim.core.distributions import chi2, norm
+from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis import tuning
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
 from viz_estim.diagnosis.finding import FEWEST, GROSS, ODDS, SHEET, Finding, judge, times
 from viz_estim.diagnosis.innovations import ljung_box
 from viz_estim.diagnosis.outlying import outlying
+from viz_estim.diagnosis.rounding import sound
 
 # A covariance too small by GROSS is an error, by less a warning; too large is never one: it costs, and misleads nobody.
 # S goes as the root of Q, as that of a random walk does in its steady state, P ≈ √(Q·R): Q may be wrong by its square.
@@ -159,13 +160,21 @@ def factor_on_noise(readings: Readings) -> float | None:
 
     With the state's share of S going as √f, as that of a random walk does in its steady state, P ≈ √(Q·R).
     """
-    if not readings.noise.any():
+    readings = readings.pick(sound(readings.noise))
+    if not len(readings):
         return None
-    spread = readings.cov - readings.noise
+    # In axes in which R is 1 and the state's share is diagonal, so that S is solved with once.
+    L = np.linalg.cholesky(readings.noise)
+    spread = np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, readings.cov - readings.noise), 1, 2))
+    share, axes = np.linalg.eigh(symmetrised(np.asarray(spread, float)))
+    squares = (np.swapaxes(axes, 1, 2) @ np.linalg.solve(L, readings.residual[..., None]))[..., 0] ** 2
 
     def excess(log_f: float) -> float:
-        S = np.exp(0.5 * log_f) * spread + np.exp(log_f) * readings.noise
-        return float(np.nanmean(squared_distance(readings.residual, S))) / readings.dof - 1
+        return (
+            float((squares / (np.exp(0.5 * log_f) * np.maximum(share, 0.0) + np.exp(log_f))).sum(1).mean())
+            / readings.dof
+            - 1
+        )
 
     try:
         return float(np.exp(scipy.optimize.brentq(excess, -_FURTHEST, _FURTHEST, xtol=0.1 * SHEET)))

@@ -39,6 +39,6 @@ def of_logs(*logs: Array) -> float:
 
 def sound(P: Array) -> np.ndarray:
     """Which of covariances (M, d, d) are finite, positive definite, and well enough conditioned to be solved with."""
-    finite: np.ndarray = np.isfinite(P).all((1, 2))
+    finite: np.ndarray = np.asarray(np.isfinite(P).all((1, 2)))
     values = np.linalg.eigvalsh(np.where(finite[:, None, None], P, 0.0))
     return np.asarray(finite & (values[:, 0] > 0) & (values[:, -1] < SOLVABLE * np.maximum(values[:, 0], TINY)))

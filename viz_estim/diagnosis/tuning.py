@@ -245,7 +245,7 @@ def _turned(case: Case, table: StageTable, before: Array) -> _Turned:
         known = np.isin(table.step, steps.get(sensor, ()))
         on[:, axes] = (get["innovation.offered"][:, i] * get["innovation.used"][:, i] * known > 0)[:, None]
     nu = get["innovation.residual"]
-    on &= (np.isfinite(H).all((1, 2)) & np.isfinite(nu).all(1))[:, None]
+    on &= np.asarray(np.isfinite(H).all((1, 2)) & np.isfinite(nu).all(1))[:, None]
     moved = np.nan_to_num(get["gain"]) @ np.nan_to_num(nu)[..., None]
     return _Turned(H, residual, noise, [np.flatnonzero(row).tolist() for row in on], moved, sensors)
 
