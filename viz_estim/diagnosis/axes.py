@@ -59,6 +59,12 @@ def _maps(size: int, unit: str) -> Iterator[tuple[str, Array]]:
         yield name, factor * np.eye(size)
 
 
+@cache
+def inverses(size: int, unit: str = "") -> tuple[tuple[str, Array], ...]:
+    """Of the same maps M⁻ᵀ, by which rows (N, size) of what was expected become what was read: x @ M⁻ᵀ."""
+    return tuple((title, np.asarray(np.linalg.inv(M).T, float)) for title, M in maps(size, unit))
+
+
 TRIED = len(maps(3)) + 1  # at most: of three numbers of an unknown unit, and whether they are squares
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean
-from viz_estim.diagnosis.axes import TRIED, explains, maps
+from viz_estim.diagnosis.axes import TRIED, explains, inverses
 from viz_estim.diagnosis.finding import TINY, WINDOW, Chance, by_ratio, level
 from viz_estim.diagnosis.fits import Against, Fitted, fitted, white
 from viz_estim.diagnosis.linear import straight
@@ -123,7 +123,7 @@ def mapped(one: Against) -> Iterator[Cause]:
     if not isinstance(one.space, Euclidean) or not 1 <= len(one.space.axes) <= 3:
         return
     m, best, what = one.r.shape[1], np.inf, ""
-    tried = [(title, one.true @ np.linalg.inv(A).T) for title, A in maps(m, one.space.axis_units[0])]
+    tried = [(title, one.true @ back) for title, back in inverses(m, one.space.axis_units[0])]
     for title, should in [*tried, (_SQUARE, one.true**2)]:  # in the reading's own unit, whose noise stays as it is
         left = float((white(one, one.z - should) ** 2).sum())
         if left < best:

@@ -95,7 +95,7 @@ def _by_process(case: Case) -> Iterator[Finding]:
     looks = [
         min(size(r.nis, r.dof, len(case.sensors))[1], ljung_box(r)[1])
         for r in case.sensors.values()
-        if len(r) >= 2 * FEWEST
+        if len(r) >= FEWEST
     ]
     if not looks or min(looks) > 0.05:
         return

@@ -77,7 +77,7 @@ SHEET = 0.05  # of a factor: what a gyro's or a wheel's data sheet leaves to a c
 HALF_THE_DIGITS = float(np.sqrt(np.finfo(float).eps))  # what is beyond is no rounding that piled up
 SOLVABLE = SHEET / (8 * float(np.finfo(float).eps))  # the condition κ by which a solve loses 8·ε·κ (Higham 2002, 7.2)
 ODDS = 20.0  # by which one cause must be likelier than another to be named alone: strong (Kass and Raftery 1995)
-_FAMILIES = 40  # statistical checks, rounded up: each has an equal share, and shares it out among what it tests
+_FAMILIES = 36  # checks that may warn by chance: each has an equal share, and shares it out among what it tests
 # Readings: as many as the plainest test, that of signs, needs for an error's share, 2⁻ⁿ. Of fewer no test tells much;
 # it silences checks, and no alarm comes of it.
 FEWEST = int(np.ceil(np.log2(_FAMILIES / _BUDGET["error"])))

@@ -15,7 +15,7 @@ import numpy as np
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3, Euclidean
-from viz_estim.diagnosis.axes import maps
+from viz_estim.diagnosis.axes import inverses, maps
 from viz_estim.diagnosis.durations import by_biases, whole
 from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import EXPLAINED, FEWEST, ODDS, TINY, WINDOW, Finding, by_ratio, judge
@@ -91,7 +91,10 @@ def forces(case: Case) -> Iterator[Finding]:
         return
     truly, told = found.truly, found.told
     own = float(np.square(truly - told).sum())
-    tried = [(float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title, A) for title, A in maps(3, "m/s²")]
+    tried = [
+        (float(np.square(told - truly @ back).sum()), title, A)
+        for (title, A), (_, back) in zip(maps(3, "m/s²"), inverses(3, "m/s²"), strict=True)
+    ]
     tried.append((float(np.square(told - found.turns).sum()), _EXCHANGED, np.eye(3)))
     left = min(one[0] for one in tried)
     explained = 1 - left / max(own, TINY)

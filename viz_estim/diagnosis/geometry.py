@@ -9,7 +9,7 @@ import numpy as np
 from viz_estim.core.distributions import norm
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, Euclidean, Product, Space, wrap
-from viz_estim.diagnosis.axes import explains, finding_of, maps
+from viz_estim.diagnosis.axes import explains, finding_of, inverses
 from viz_estim.diagnosis.evidence import Case, Readings, tells_reading
 from viz_estim.diagnosis.finding import FEWEST, HALF_THE_DIGITS, TINY, Finding, level
 from viz_estim.diagnosis.kinematics import imu_axes, scale
@@ -157,9 +157,9 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         sound = np.isfinite(readings.nis) & np.isfinite(readings.z).all(1) & np.isfinite(readings.predicted).all(1)
         z, predicted, precision = readings.z[sound], readings.predicted[sound], np.linalg.inv(readings.cov[sound])
         best, what = np.inf, ""
-        tried = maps(len(space.axes), space.axis_units[0])
-        for title, M in tried:
-            off = z - predicted @ np.linalg.inv(M).T
+        tried = inverses(len(space.axes), space.axis_units[0])
+        for title, back in tried:
+            off = z - predicted @ back
             value = float(np.einsum("ti,tij,tj->", off, precision, off))
             if value < best:
                 best, what = value, title

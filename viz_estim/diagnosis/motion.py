@@ -11,7 +11,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, wrap
 from viz_estim.diagnosis import clouds, forces
 from viz_estim.diagnosis.against import slip as bound
-from viz_estim.diagnosis.axes import maps
+from viz_estim.diagnosis.axes import inverses, maps
 from viz_estim.diagnosis.durations import composed, whole
 from viz_estim.diagnosis.evidence import Case, once
 from viz_estim.diagnosis.finding import (
@@ -197,7 +197,8 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Ar
     own = float(np.square(truly - told).sum())
     # In what was predicted, whose size stays as it is: a unit that makes it small explains nothing by that.
     tried = [
-        (float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title, told @ A.T) for title, A in maps(3, "rad/s")
+        (float(np.square(told - truly @ back).sum()), title, told @ A.T)
+        for (title, A), (_, back) in zip(maps(3, "rad/s"), inverses(3, "rad/s"), strict=True)
     ]
     if in_world is not None:
         tried.append((float(np.square(truly - in_world).sum()), _WORLD, in_world))

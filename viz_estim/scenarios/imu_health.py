@@ -30,7 +30,7 @@ _SHORTEST_FREEZE = 0.3  # s: of fewer windows of 0.1 s than three no turn is tol
 
 _SPAN = 2.5  # counts: of what stays within one of a value it is two at most, to rounding
 _RATE = 1e-4  # of a run in which noise alone passes for motion, over all its samples and channels
-_FREEZE = _RATE / 40  # and for a freeze, of a gyro or of an accelerometer: a check's share of a run's errors
+_FREEZE = _RATE / 36  # and for a freeze, of a gyro or of an accelerometer: a check's share of a run's errors
 _CHANNELS = 6
 _FEWEST = 20  # readings of which von Neumann's ratio can tell the smoothest motion at that rate
 
