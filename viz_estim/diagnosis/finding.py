@@ -11,6 +11,10 @@ standard deviation it hides in, or readings of which each second one tells nothi
 error is no matter of the estimate but of a test against that size (a minimum-effect test; Murphy and Myors 1999): the p
 of data in which the effect *is* that large must be below the error's share too. So errors keep to 10⁻⁴ a run not only
 where a filter's model is exact, but wherever it is wrong by less than that.
+
+Noise that is coloured, which no filter's model has, makes means and slopes scatter more than white noise does. What is
+fitted is held against both (`Chance`): warnings keep to their share in either, errors to theirs where noise is white,
+and to that of warnings where it is coloured.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Willsky and Jones (1976), the generalised likelihood ratio test. A fault δ_k of
 s_k = δ_k − H·g_k, where g is how far the fault has moved the estimate: g⁺ = g + K·s, g' = F·g. The innovations are
 white if the filter is right, so that the fault's size is estimated by b/A, with A = Σ sᵀS⁻¹s and b = Σ sᵀS⁻¹ν, and
 b/√A is N(0, 1) where there is no fault. Where innovations are coloured the sum b scatters more: by how much its parts
-in 20 stretches of the run say (a cluster-robust variance; Liang and Zeger 1986), and the larger p of the two counts. A
+in 20 stretches of the run say (a cluster-robust variance; Liang and Zeger 1986), and both p count (`finding.Chance`). A
 fault that the state soaks up (a constant lag while driving straight) is found by what is left of it.
 """
 
