@@ -49,7 +49,7 @@ def held(r: Array, belief: str) -> evidence.Case:
 @pytest.mark.parametrize("rho", [0.0, 0.3, 0.6])
 def test_a_fit_keeps_to_its_rate_where_noise_is_coloured(rho: float) -> None:
     """Of AR(1) noise, whose mean is (1 + ρ)/(1 − ρ) times as uncertain, up to 4: by the larger p of a `Chance`."""
-    rng, draws = np.random.default_rng(21), 600
+    rng, draws = np.random.default_rng(21), 300
     X = np.stack([np.ones(400), np.sin(0.02 * np.arange(400))], axis=-1)[:, None, :]
     noise = lfilter([(1 - rho**2) ** 0.5], [1.0, -rho], rng.standard_normal((draws, 500)), axis=1)[:, 100:]
     p = np.array([max(fits.least_squares(X, y[:, None]).p(0)) for y in noise])
