@@ -14,7 +14,7 @@ from viz_estim.diagnosis.evidence import Case
 from viz_estim.diagnosis.finding import FEWEST, GROSS, ODDS, REPEATED, Finding, at_steps, level
 from viz_estim.recording.tables import StageTable
 
-_LOOKED_AT = 32  # steps at most, at which modes are looked for: each has its share of the check's rate
+_LOOKED_AT = 100  # steps at most, at which modes are looked for: each has its share of the check's rate
 
 _NEAR = 0.1  # the share of a normal cloud that lies about its mean, to be held against what does: it decides no rate
 
