@@ -28,7 +28,7 @@ SHORT: dict[str, dict[str, Any]] = {
     "beacons": {},
 }
 OTHER: dict[str, dict[str, Any]] = {
-    "gps-one-late": {"duration": 20.0},
+    "gps-one-late": {"duration": 28.0},
     "process-noise-too-small": {"duration": 14.0},
     "glitches": {"duration": 20.0},
     "clipped-ranges": {"duration": 20.0},

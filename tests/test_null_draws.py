@@ -10,8 +10,20 @@ from test_thresholds import case_of, severities
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean, Product
-from viz_estim.diagnosis import clocks, confidence, errors, evidence, kinematics, sensors, truth, weighing
-from viz_estim.diagnosis.finding import _FAMILIES, GROSS, times
+from viz_estim.diagnosis import (
+    clocks,
+    confidence,
+    errors,
+    evidence,
+    fits,
+    kinematics,
+    linear,
+    rounding,
+    sensors,
+    truth,
+    weighing,
+)
+from viz_estim.diagnosis.finding import _FAMILIES, GROSS, Chance, judge, level, times
 from viz_estim.diagnosis.fits import Against
 from viz_estim.diagnosis.outlying import outlying
 from viz_estim.scenarios.imu_health import GRAVITY, frozen_gyro, still_prefix
@@ -32,6 +44,54 @@ def held(r: Array, belief: str) -> evidence.Case:
     case = replace(case, run=replace(case.run, properties=case.run.properties | {"belief": belief}))
     object.__setattr__(case, "_against", [one])
     return case
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.3, 0.6])
+def test_a_fit_keeps_to_its_rate_where_noise_is_coloured(rho: float) -> None:
+    """Of AR(1) noise, whose mean is (1 + ρ)/(1 − ρ) times as uncertain, up to 4: by the larger p of a `Chance`."""
+    rng, draws = np.random.default_rng(21), 300
+    X = np.stack([np.ones(400), np.sin(0.02 * np.arange(400))], axis=-1)[:, None, :]
+    noise = lfilter([(1 - rho**2) ** 0.5], [1.0, -rho], rng.standard_normal((draws, 500)), axis=1)[:, 100:]
+    p = np.array([max(fits.least_squares(X, y[:, None]).p(0)) for y in noise])
+    for rate in (0.05, SHARE):
+        assert (p < rate).sum() <= draws * rate + 3 * (draws * rate) ** 0.5
+
+
+def test_an_error_s_share_is_of_white_noise_and_a_warning_s_of_coloured_noise_too() -> None:
+    error, warning = level("error", 2) / 2, level("warning", 2) / 2
+    assert judge(Chance(error, warning), 2, large=True) == "error"
+    assert judge(Chance(warning, error), 2, large=True) == "warning"
+    assert judge(Chance(error, 4 * warning), 2, large=True) is None
+    assert judge(Chance(error, error), 2, large=Chance(error, 4 * warning)) == "warning"
+    assert judge(Chance(error, float("nan")), 2, large=True) is None
+
+
+@pytest.mark.parametrize("speed", [0.3, 3.0])
+def test_a_lag_is_a_matter_of_a_rate_as_long_as_the_way_is_straight(speed: float) -> None:
+    """Of a circle at ω, the line leaves sin²(½ωτ) of the way in τ: a half at ωτ = π/2."""
+    time = 0.01 * np.arange(3000)
+    way = np.stack([np.cos(speed * time), np.sin(speed * time)], axis=-1)
+    told = [
+        linear.straight(Euclidean(("x", "y"), "m"), way, time, s * np.pi / 2 / speed) for s in (-0.95, 0.1, 0.95, 1.05)
+    ]
+    assert told == [True, True, True, False]
+    assert linear.straight(Euclidean(("x", "y"), "m"), time[:, None] * [1.0, 2.0], time, 14.0)
+
+
+def test_a_covariance_is_sound_where_it_can_be_solved_with() -> None:
+    turn = np.linalg.qr(np.random.default_rng(22).standard_normal((3, 3)))[0]
+    told = {(1.0, 1.0, 1.0): True, (1e-12, 1.0, 1.0): True, (1e-15, 1.0, 1.0): False, (-1e-3, 1.0, 1.0): False}
+    P = np.array([turn @ np.diag(values) @ turn.T for values in told] + [np.full((3, 3), np.nan)])
+    assert rounding.sound(P).tolist() == [*told.values(), False]
+
+
+def test_a_start_is_the_start_s_until_readings_or_the_process_have_changed_it() -> None:
+    P = np.array([1.0, 0.6, 0.4, 1.5, 3.0])[:, None, None] * np.eye(2)
+    case = case_of(np.zeros((5, 1)))
+    plane = Euclidean(("x", "y"), "m")
+    ends = {"mean": np.zeros((5, 2)), "cov": P}
+    run = replace(case.run, space=plane, step=np.arange(5), ends=ends, truth=np.zeros((5, 2)))
+    assert [errors._of_the_start(replace(case, run=run), k) for k in range(5)] == [True, True, False, True, False]
 
 
 def test_readings_of_their_own_noise_have_no_cause() -> None:

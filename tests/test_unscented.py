@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from viz_estim.core import quaternions, unscented
-from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.beliefs import Gaussian, normal
 from viz_estim.core.measurement import Measurement, Sensor
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import Tick, run
@@ -192,7 +192,7 @@ def test_a_gated_sensor_moves_nothing_and_members_of_a_batch_are_gated_alone() -
 def test_a_gate_refuses_good_readings_as_often_as_it_says(gate: float) -> None:
     rng, N = np.random.default_rng(9), 20_000
     belief = Gaussian(Euclidean(tuple("abcd")), np.zeros((N, 4)), np.broadcast_to(covariance(rng, 4), (N, 4, 4)))
-    x = unscented.normal(belief.space, belief.mean, belief.cov, rng)
+    x = normal(belief.space, belief.mean, belief.cov, rng)
     stage = update(belief, x + np.sqrt(0.5) * rng.standard_normal((N, 4)), gated(gate), symmetric(4))
     np.testing.assert_allclose(1 - stage.innovation.used.mean(0), 1 - gate, atol=4 * np.sqrt(gate * (1 - gate) / N))
 

@@ -114,7 +114,7 @@ def diagnose(run: Run) -> list[Finding]:
             found += check(under_test)
         odd = (*SYMPTOMS, "biased_innovation", "particles_far", "particles_collapsed")
         if any(f.severity != "note" and f.code in odd for f in found) or not errors.has_covariance(under_test):
-            found += motion.prediction(under_test)  # else the filter knows how wrong it is
+            found += motion.predictions(under_test)  # else the filter knows how wrong it is
         # Noises are tuned once nothing else is wrong: until then a factor on them would only hide it.
         causes = [f for f in ranked(found) if f.severity == "error" and f.tier <= _TIMES and f.code != "start"]
         found += confidence.by_sensor(under_test, tune=not causes)

@@ -13,15 +13,15 @@ import numpy as np
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, SO2, SO3, Product, Space
-from viz_estim.diagnosis.evidence import Case, jacobians, once, tells_gain, tells_reading
-from viz_estim.diagnosis.finding import HALF_THE_DIGITS
+from viz_estim.diagnosis.evidence import Case, once, tells_gain, tells_reading
+from viz_estim.diagnosis.finding import FEWEST, HALF_THE_DIGITS, MOST, SHEET
 from viz_estim.diagnosis.fits import Against
 from viz_estim.diagnosis.likelihoods import by_particles
+from viz_estim.diagnosis.linear import jacobians
 from viz_estim.diagnosis.recovered import recovered
 from viz_estim.recording.layout import leaves
 
-FEWEST = 30
-_TURNED = 0.1  # rad
+_TURNED = SHEET**0.5  # rad: an error θ of an angle leaves θ² of what turns with it, here a share that counts
 _HALF = float(np.finfo(float).eps) ** -0.5  # of the digits, as a ratio
 
 
@@ -43,7 +43,7 @@ def _against(case: Case) -> Iterator[Against]:
         assert isinstance(space, Product)
         mean, cov = case.sequence.before(table)
         at = np.array([row[int(step)] for step in table.step])
-        truth, H = run.truth[at], jacobians(cov, get["innovation.cross_cov"])
+        truth, H = run.truth[at], jacobians(case, table)
         control = run.inputs["control"][at] if "control" in run.inputs else None
         used = {int(step) for r in case.sensors.values() for step in r.step}
         counts = np.array([int(step) in used for step in table.step]) & np.isfinite(mean).all(1)
@@ -55,7 +55,7 @@ def _against(case: Case) -> Iterator[Against]:
             rows = counts & (get["innovation.offered"][:, sensor] > 0) & np.isfinite(H[:, axes]).all((1, 2))
             rows &= np.isfinite(residual[:, axes]).all(1)
             rows[rows] &= np.linalg.eigvalsh(R[rows])[:, 0] > 0
-            if rows.sum() < FEWEST or i > 40:
+            if rows.sum() < FEWEST or i > MOST:
                 continue
             z, expected = get["innovation.z"][rows, numbers], get["innovation.predicted"][rows, numbers]
             std = np.sqrt(np.median(np.diagonal(R[rows], axis1=1, axis2=2), axis=0))
@@ -129,8 +129,9 @@ def _spread(H: Array, P: Array) -> Array:
 def slip(J: Array, error: Array, mean: Array, space: Space) -> Array:
     """By how much J·e may be wrong (M,), for a Jacobian J (M, m, d) at the estimate; 0 where it is constant.
 
-    Where it turns with an angle, an error of that angle (rad) changes it by as large a share; infinite beyond 0.1 rad.
-    Else ½·L·|e|², with L from its changes between neighbouring rows, over the directions that it sees.
+    Where it turns with an angle, an error of that angle (rad) changes it by as large a share (|R − I| ≤ θ); infinite
+    beyond `_TURNED`. Else ½·L·|e|² (Taylor), with L the largest of its changes between neighbouring rows, over the
+    directions that it sees and beyond rounding.
     """
     seen = (np.abs(J).max((0, 1)) > HALF_THE_DIGITS * np.abs(J).max()) & (error**2).any(0)
     bends = seen & (np.abs(J - J[:1]).max((0, 1)) > HALF_THE_DIGITS * np.abs(J).max())
@@ -145,6 +146,6 @@ def slip(J: Array, error: Array, mean: Array, space: Space) -> Array:
     size = np.sqrt(np.mean(e**2, axis=0))
     moved = np.linalg.norm(step / size, axis=1)
     change = np.linalg.norm((J[1:] - J[:-1]) * size, axis=(1, 2))
-    far = moved > 1e-9
-    L = float(np.quantile(change[far] / moved[far], 0.9)) if far.any() else 0.0
+    far = moved > HALF_THE_DIGITS * moved.max(initial=0.0)
+    L = float((change[far] / moved[far]).max(initial=0.0))
     return np.asarray(0.5 * L * (e**2 / size**2).sum(1))

@@ -9,7 +9,7 @@ from itertools import permutations, product
 import numpy as np
 
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.finding import GROSS, ODDS, Finding
+from viz_estim.diagnosis.finding import GROSS, ODDS, TINY, Finding
 from viz_estim.scenarios.imu_health import GRAVITY
 
 UNITS = {  # by what a sensor reads: the factor that brings a reading to what was expected
@@ -31,7 +31,7 @@ def explains(title: str, own: float, left: float, nothing: float, count: int) ->
     """Whether a map is named: it leaves a GROSS-th at most of the squares `own`, and foresees what there is likelier by
     ODDS than nothing at all does, which leaves the squares `nothing` of `count` numbers: a unit that makes all small is
     none. These choose among causes; that there is one, the likelihood ratio says."""
-    foreseen = 0.5 * count * np.log(nothing / max(left, 1e-300)) > np.log(ODDS)
+    foreseen = 0.5 * count * np.log(nothing / max(left, TINY)) > np.log(ODDS)
     return bool(own > GROSS * left and (title.startswith("axes") or foreseen))
 
 
@@ -57,6 +57,15 @@ def _maps(size: int, unit: str) -> Iterator[tuple[str, Array]]:
                 yield "axes " + " ".join(f"{s}{'xyz'[o]}" for s, o in zip(names, order, strict=True)), M
     for name, factor in units(unit).items():
         yield name, factor * np.eye(size)
+
+
+@cache
+def inverses(size: int, unit: str = "") -> tuple[tuple[str, Array], ...]:
+    """Of the same maps M⁻ᵀ, by which rows (N, size) of what was expected become what was read: x @ M⁻ᵀ."""
+    return tuple((title, np.asarray(np.linalg.inv(M).T, float)) for title, M in maps(size, unit))
+
+
+TRIED = len(maps(3)) + 1  # at most: of three numbers of an unknown unit, and whether they are squares
 
 
 def finding_of(name: str, steps: tuple[int, int], what: str, explained: float, gain: float) -> Finding:

@@ -12,12 +12,12 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean
-from viz_estim.diagnosis.axes import explains, maps
-from viz_estim.diagnosis.finding import level
+from viz_estim.diagnosis.axes import TRIED, explains, inverses
+from viz_estim.diagnosis.finding import TINY, WINDOW, Chance, by_ratio, level
 from viz_estim.diagnosis.fits import Against, Fitted, fitted, white
+from viz_estim.diagnosis.linear import straight
 from viz_estim.diagnosis.naming import SIGNS, likeliest, named, of_reading
 
-_SPAN = 0.1  # s over which a rate is taken at least: noise of the truth would hide it in a shorter one
 _SQUARE = "squares"
 
 
@@ -28,8 +28,8 @@ class Cause(NamedTuple):
     code: str
     gain: float
     k: int
-    p: float
-    large: bool | float
+    p: float | Chance
+    large: bool | float | Chance
     size: float
     explained: float
     evidence: dict[str, object]
@@ -47,12 +47,12 @@ def bias(one: Against) -> Iterator[Cause]:
     m = one.r.shape[1]
     fit = fitted(one, np.broadcast_to(np.eye(m), (len(one.r), m, m)))
     size = np.abs(fit.coefficients) / _std(one)
-    worst = int(np.argmax(-fit.p + 1e-9 * size))
+    worst = min(range(m), key=lambda i: (fit.p(i), -size[i]))
     axis, unit, label = one.space.axes[worst], one.space.axis_units[worst], one.axis(worst)
     value = float(fit.coefficients[worst])
     yield Cause(
-        "biased_innovation", fit.gain, m, float(fit.p[worst]),
-        fit.p_beyond(worst, float(np.sqrt(np.mean(one.foreseen[:, worst])))), float(size[worst]), fit.explained,
+        "biased_innovation", fit.gain, m, fit.p(worst),
+        fit.p(worst, float(np.sqrt(np.mean(one.foreseen[:, worst])))), float(size[worst]), fit.explained,
         {"component": f"{one.part}.{axis}" if one.part else axis, "bias": value, "mean_sigma": float(size[worst])},
         f"against the truth, readings of {label} are {value:+.3g} {unit} off on the average: the sensor has a bias "
         "that the filter does not know of",
@@ -71,11 +71,11 @@ def lever_arm(one: Against) -> Iterator[Cause]:
     fit = fitted(one, one.attitude)
     size = np.abs(fit.coefficients) / _std(one)
     worst = int(np.argmax(size))
-    words = [f"{abs(v):.2g} m {way[int(v < 0)]}" for v, way, p in zip(fit.coefficients, _WAYS, fit.p, strict=False)
-             if p < level("warning", 1)]  # fmt: skip
+    along = [(i, float(v)) for i, v in enumerate(fit.coefficients) if max(fit.p(i)) < level("warning", 1)]
+    words = [f"{abs(v):.2g} m {_WAYS[i][int(v < 0)]}" for i, v in along]
     yield Cause(
-        "biased_innovation", fit.gain, len(fit.coefficients), float(fit.p[worst]),
-        fit.p_beyond(worst, float(np.sqrt(np.mean(one.foreseen)))), float(size[worst]), fit.explained,
+        "biased_innovation", fit.gain, len(fit.coefficients), fit.p(worst),
+        fit.p(worst, float(np.sqrt(np.mean(one.foreseen)))), float(size[worst]), fit.explained,
         {"lever_arm": fit.coefficients.tolist()},
         f"against the truth, readings of {one.label} are those of a place {' and '.join(words)} of the one that is "
         "estimated, which turns with the body: a lever arm that the model lacks",
@@ -91,7 +91,7 @@ def lag(one: Against, interval: float) -> Iterator[Cause]:
     """r = −τ·ż + constant, ż the rate of what the truth would give, by central differences."""
     if len(one.time) < 3 or (np.diff(one.time) <= 0).any():
         return
-    k = min(max(1, round(0.5 * _SPAN / float(np.median(np.diff(one.time))))), (len(one.time) - 1) // 2)
+    k = min(max(1, round(0.5 * WINDOW / float(np.median(np.diff(one.time))))), (len(one.time) - 1) // 2)
     span = (one.time[2 * k :] - one.time[: -2 * k])[:, None]
     rate = one.space.minus(one.true[2 * k :], one.true[: -2 * k]) / span
     middle = one.pick(slice(k, -k))
@@ -99,18 +99,18 @@ def lag(one: Against, interval: float) -> Iterator[Cause]:
     design = np.concatenate([-rate[..., None], np.broadcast_to(np.eye(m), (len(rate), m, m))], axis=-1)
     both, alone = fitted(middle, design), fitted(middle, design[..., :1])
     # A constant beside it costs power where the way is straight; it is fitted only where there is one for sure.
-    fit = both if both.p[1:].min() < level("warning", m) else alone
-    p, tau = float(fit.p[0]), float(fit.coefficients[0])
+    fit = both if min(max(both.p(i + 1)) for i in range(m)) < level("warning", m) else alone
+    p, tau = fit.p(0), float(fit.coefficients[0])
     shift = float(np.sqrt(np.mean(white(middle, tau * rate) ** 2)))
-    if abs(tau) < 0.5 * interval or abs(tau) > 0.1 * (one.time[-1] - one.time[0]):
-        return  # so long a lag is no matter of a rate
+    if abs(tau) < 0.5 * interval or not straight(one.space, one.true, one.time, tau):
+        return
     late = "late" if tau > 0 else "early"
     place = set(one.space.axis_units) == {"m"} and len(one.space.axes) > 1
     where = "behind" if tau > 0 else "ahead of"
     alike = f"; or it sits {where} what moves, which looks alike at one speed" if place else ""
     readings = float(np.median(np.diff(one.time)))
     yield Cause(
-        "lag", alone.gain, 1, p, fit.p_beyond(0, 0.5 * interval), shift, alone.explained,
+        "lag", alone.gain, 1, p, fit.p(0, 0.5 * interval), shift, alone.explained,
         {"lag_s": tau, "lag_samples": tau / readings},
         f"against the truth, readings of {one.name} come {abs(tau):.3g} s {late} ({abs(tau) / readings:.1f} of its "
         f"samples): a delay of the sensor or of the truth, another clock, or an index that is one off{alike}",
@@ -123,7 +123,7 @@ def mapped(one: Against) -> Iterator[Cause]:
     if not isinstance(one.space, Euclidean) or not 1 <= len(one.space.axes) <= 3:
         return
     m, best, what = one.r.shape[1], np.inf, ""
-    tried = [(title, one.true @ np.linalg.inv(A).T) for title, A in maps(m, one.space.axis_units[0])]
+    tried = [(title, one.true @ back) for title, back in inverses(m, one.space.axis_units[0])]
     for title, should in [*tried, (_SQUARE, one.true**2)]:  # in the reading's own unit, whose noise stays as it is
         left = float((white(one, one.z - should) ** 2).sum())
         if left < best:
@@ -153,21 +153,21 @@ def mapped(one: Against) -> Iterator[Cause]:
 
 
 def listed(one: Against, left: float, what: str, explained: float) -> Cause | None:
-    """A map without a number that is fitted, by the sum of squares that it leaves: of 60 that are tried."""
+    """A map without a number that is fitted, by the sum of squares that it leaves: of as many as are TRIED at most."""
     own, (M, m) = float((white(one, one.r) ** 2).sum()), one.r.shape
-    gain = 0.5 * M * m * float(np.log(own / max(left, 1e-300)))
+    gain = 0.5 * M * m * float(np.log(own / max(left, TINY)))
     nothing = float((white(one, one.z[:, :m]) ** 2).sum())
     if not explains(what, own, left, nothing, M * m):
         return None
     return Cause(
-        "units_or_axes", gain, 1, float(np.exp(-min(gain, 700.0))) * 60, True,
+        "units_or_axes", gain, 1, TRIED * by_ratio(gain), True,
         float(np.sqrt(max(own - left, 0.0) / (M * m))), explained,
         {"map": what, "log_likelihood_gain": gain}, "", "", True,
     )  # fmt: skip
 
 
 def _explained(one: Against, left: float) -> float:
-    return 1 - left / max(float((white(one, one.r) ** 2).sum()), 1e-300)
+    return 1 - left / max(float((white(one, one.r) ** 2).sum()), TINY)
 
 
 def scaled(one: Against) -> Iterator[Cause]:
@@ -178,10 +178,10 @@ def scaled(one: Against) -> Iterator[Cause]:
     factor = 1 + float(fit.coefficients[0])
     unit_size = float(np.sqrt(np.mean(white(one, one.true) ** 2)))
     foreseen = float(np.sqrt(np.mean(one.foreseen / np.diagonal(one.noise, axis1=1, axis2=2))))
-    known, error = of_reading(one.space.axis_units[0]), float(fit.error[0])
+    known, error = of_reading(one.space.axis_units[0]), float(fit.error[:, 0].max())
     sign = likeliest(factor, known, error) in SIGNS
     yield Cause(
-        "units_or_axes", fit.gain, 1, float(fit.p[0]), fit.p_beyond(0, foreseen / max(unit_size, 1e-300)),
+        "units_or_axes", fit.gain, 1, fit.p(0), fit.p(0, foreseen / max(unit_size, TINY)),
         abs(factor - 1) * unit_size, fit.explained, {"map": f"a factor of {factor:.4g}", "factor": factor},
         f"readings of {one.label} are {factor:.4g}× what the truth would give: "
         f"{named(factor, known, error)}",

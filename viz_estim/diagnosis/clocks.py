@@ -8,12 +8,11 @@ import numpy as np
 
 from viz_estim.core.spaces import Euclidean
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import SHEET, Finding, judge
+from viz_estim.diagnosis.finding import FEWEST, SHEET, Finding, judge
 from viz_estim.diagnosis.fits import slope
 from viz_estim.diagnosis.naming import likeliest
 
 _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9, "minutes": 1 / 60}
-_FEWEST = 12
 
 
 def clock(case: Case) -> Iterator[Finding]:
@@ -30,12 +29,12 @@ def clock(case: Case) -> Iterator[Finding]:
             x, v = run.truth[:, space.at[name]], run.truth[:, space.at[rate]]
             way, foreseen = np.diff(x, axis=0), 0.5 * (v[1:] + v[:-1]) * dt[:, None]
             rows = np.isfinite(way).all(1) & np.isfinite(foreseen).all(1) & (dt > 0)
-            if rows.sum() < _FEWEST:
+            if rows.sum() < FEWEST:
                 continue
             forth, back = (slope(a[rows].ravel(), b[rows].ravel()) for a, b in ((way, foreseen), (foreseen, way)))
             units = likeliest(back.value, _UNITS, back.error)
             off = slope((way - foreseen)[rows].ravel(), foreseen[rows].ravel())
-            severity = judge(off.p_beyond(SHEET), 1, large=True)
+            severity = judge(off.p(SHEET), 1, large=True)
             if severity and units:
                 yield Finding(
                     "stamps", severity, None, case.whole, {"kind": "unit", "factor": back.value, "slope": forth.value},

@@ -15,11 +15,8 @@ from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SE2, SO2, SO3, wrap
 from viz_estim.diagnosis.durations import by_biases, whole
-from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import EXPLAINED, level
-
-_FEWEST = 20
-WINDOW = 0.1  # s
+from viz_estim.diagnosis.evidence import Case, once
+from viz_estim.diagnosis.finding import EXPLAINED, FEWEST, level
 
 
 class Moves(NamedTuple):
@@ -32,6 +29,10 @@ class Moves(NamedTuple):
 
 def moves(case: Case) -> Moves | None:
     """Of a planar robot's particles; None where there are none, or no truth."""
+    return once(case, "_moves", _moves)
+
+
+def _moves(case: Case) -> Moves | None:
     run = case.run
     found = [t for t in run.stages.values() if "states" in t.values and t.name != "start"]
     found = [t for t in found if not {"ancestors", "log_likelihoods"} & t.values.keys()]
@@ -48,7 +49,7 @@ def moves(case: Case) -> Moves | None:
         truly = pose.minus(run.truth[at], run.truth[at - 1])
         if np.isfinite(told).all() and np.isfinite(truly).all():
             kept.append((step, truly, told))
-    if len(kept) < _FEWEST:
+    if len(kept) < FEWEST:
         return None
     steps, truly_, told_ = zip(*kept, strict=True)
     return _unwrapped(case, Moves(np.array(steps), np.array(truly_), np.array(told_)))
@@ -82,7 +83,7 @@ def moves_of_means(case: Case) -> Moves | None:
     told = pose.minus(table.mean[:, at], before[:, at])
     truly = pose.minus(run.truth[row][:, at], run.truth[np.maximum(row - 1, 0)][:, at])
     fine = np.isfinite(told).all(1) & np.isfinite(truly).all(1) & (row > 0) & (table.step > case.first)
-    return _unwrapped(case, Moves(table.step[fine], truly[fine], told[fine])) if fine.sum() >= _FEWEST else None
+    return _unwrapped(case, Moves(table.step[fine], truly[fine], told[fine])) if fine.sum() >= FEWEST else None
 
 
 def turns_of_means(case: Case, window: float) -> tuple[str, Moves, Array] | None:
@@ -112,7 +113,7 @@ def turns_of_means(case: Case, window: float) -> tuple[str, Moves, Array] | None
     turned, in_world = (_composed(q[rows]) for q in (turn, about))
     truly = space.minus(run.truth[row[rows[:, -1]]][:, at], run.truth[row[rows[:, 0]] - 1][:, at])
     known = np.isfinite(truly).all(1)
-    if known.sum() < _FEWEST:
+    if known.sum() < FEWEST:
         return None
     return name, Moves(by.step[rows[known, 0]], truly[known], turned[known]), in_world[known]
 

@@ -11,18 +11,20 @@ from dataclasses import replace
 import numpy as np
 import scipy
 
-from viz_estim.core.consistency import squared_distance
 from viz_estim.core.distributions import chi2, norm
+from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis import tuning
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, Finding, judge, times
+from viz_estim.diagnosis.finding import FEWEST, GROSS, ODDS, SHEET, Finding, judge, times
+from viz_estim.diagnosis.innovations import ljung_box
 from viz_estim.diagnosis.outlying import outlying
+from viz_estim.diagnosis.rounding import sound
 
 # A covariance too small by GROSS is an error, by less a warning; too large is never one: it costs, and misleads nobody.
 # S goes as the root of Q, as that of a random walk does in its steady state, P ≈ √(Q·R): Q may be wrong by its square.
 _GROSS_Q = GROSS**2
-_FEWEST = 10
+_FURTHEST = 2 * np.log(1e3)  # log factors on a variance that are looked for: a unit may be wrong by a thousand
 
 
 def by_sensor(case: Case, *, tune: bool) -> Iterator[Finding]:
@@ -53,7 +55,7 @@ def _by_sensor(case: Case, tune: bool) -> Iterator[Finding]:
     spoken = False
     for name, readings in case.sensors.items():
         N, dof = len(readings), readings.dof
-        if N < _FEWEST:
+        if N < FEWEST:
             continue
         ratio, p, p_gross = size(readings.nis, dof, len(case.sensors))
         if judge(p, 2 * len(case.sensors), large=False) is None:
@@ -61,7 +63,7 @@ def _by_sensor(case: Case, tune: bool) -> Iterator[Finding]:
         over, far = ratio > 1, outlying(readings.nis, dof, len(case.sensors)).far
         tuned, rho = tuning.factors(case) if tune else {}, lag_one(readings.white)
         factor = tuned[name].factor if name in tuned else factor_on_noise(readings.pick(~far))
-        if factor is not None and ((factor > 1) != over or not 1e-4 < factor < 1e4):
+        if factor is not None and (factor > 1) != over:
             factor = None
         evidence = {"mean_nis": float(readings.nis.mean()), "dof": dof, "readings": N, "p": p, "factor_on_R": factor}
         process = None
@@ -87,12 +89,13 @@ def _by_process(case: Case) -> Iterator[Finding]:
     """The likelihood ratio of another Q (`tuning`): twice its logarithm is χ²(1) if Q is right (Wilks 1938).
 
     It tells a wrong Q from innovations whose size is right and whose order is not. Only looked at where innovations
-    look odd at the level of 0.05, by their size or by Ljung and Box, which can but lower its false alarms.
+    look odd at the level of 0.05, by their size or by Ljung and Box, which saves the time of tuning and can but lower
+    its false alarms.
     """
     looks = [
-        min(size(r.nis, r.dof, len(case.sensors))[1], ljung_box(r))
+        min(size(r.nis, r.dof, len(case.sensors))[1], ljung_box(r)[1])
         for r in case.sensors.values()
-        if len(r) >= 2 * _FEWEST
+        if len(r) >= FEWEST
     ]
     if not looks or min(looks) > 0.05:
         return
@@ -130,15 +133,6 @@ def _more_noise(factor: float, of: tuning.Tuned, case: Case) -> str:
     return f"{more}; where the model lacks a motion, add that to the state instead"
 
 
-def ljung_box(readings: Readings, lags: int = 10) -> float:
-    """The chance of innovations so coloured (Ljung and Box 1978)."""
-    white, N = readings.white - readings.white.mean(0), len(readings)
-    total = np.maximum((white**2).sum(0), 1e-300)
-    rho = np.stack([(white[k:] * white[:-k]).sum(0) / total for k in range(1, min(lags, N // 5) + 1)])
-    Q = N * (N + 2) * float((rho**2 / (N - np.arange(1, len(rho) + 1))[:, None]).sum())
-    return float(chi2.sf(Q, rho.size))
-
-
 def size(nis: Array, dof: int, sensors: int) -> tuple[float, float, float]:
     """How large NIS are, as a multiple of what they should be; the chance of that; and that of as much or more if S is
     too small by GROSS. Without outliers (`outlying`), of a run with so many sensors."""
@@ -166,17 +160,24 @@ def factor_on_noise(readings: Readings) -> float | None:
 
     With the state's share of S going as √f, as that of a random walk does in its steady state, P ≈ √(Q·R).
     """
-    if not readings.noise.any():
+    readings = readings.pick(sound(readings.noise))
+    if not len(readings):
         return None
-    spread = readings.cov - readings.noise
+    # In axes in which R is 1 and the state's share is diagonal, so that S is solved with once.
+    L = np.linalg.cholesky(readings.noise)
+    spread = np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, readings.cov - readings.noise), 1, 2))
+    share, axes = np.linalg.eigh(symmetrised(np.asarray(spread, float)))
+    squares = (np.swapaxes(axes, 1, 2) @ np.linalg.solve(L, readings.residual[..., None]))[..., 0] ** 2
 
     def excess(log_f: float) -> float:
-        S = np.exp(0.5 * log_f) * spread + np.exp(log_f) * readings.noise
-        return float(np.nanmean(squared_distance(readings.residual, S))) / readings.dof - 1
+        return (
+            float((squares / (np.exp(0.5 * log_f) * np.maximum(share, 0.0) + np.exp(log_f))).sum(1).mean())
+            / readings.dof
+            - 1
+        )
 
-    low, high = np.log(1e-4), np.log(1e6)
     try:
-        return float(np.exp(scipy.optimize.brentq(excess, low, high, xtol=1e-3)))
+        return float(np.exp(scipy.optimize.brentq(excess, -_FURTHEST, _FURTHEST, xtol=0.1 * SHEET)))
     except ValueError:
         return None
 

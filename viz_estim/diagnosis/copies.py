@@ -11,10 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import Finding, at_steps
-
-_FEWEST = 3  # steps at which it is seen
-_ROUNDED = 8 * float(np.finfo(np.float32).eps)  # of logarithms that were normalised, of the coarser floats
+from viz_estim.diagnosis.finding import REPEATED, Finding, at_steps
+from viz_estim.diagnosis.rounding import of_logs
 
 
 def together(case: Case) -> Iterator[Finding]:
@@ -34,7 +32,7 @@ def together(case: Case) -> Iterator[Finding]:
             if same.any():
                 parted = parted or not still[same].all()
                 steps.append(int(table.step[row]))
-        if len(steps) >= _FEWEST and not parted:
+        if len(steps) >= REPEATED and not parted:
             yield Finding(
                 "particles_collapsed", "error", None, (steps[0], steps[-1]), {"steps": len(steps), "kind": "together"},
                 "copies of a particle stay copies in the prediction: no noise is added to them, or one draw to all, so "
@@ -59,10 +57,9 @@ def weighed_again(case: Case) -> Iterator[Finding]:
                 continue  # a cloud that was thinned
             kept, drawn = before[of], (of != np.arange(len(of))).any()
             shift = kept - after
-            size = max(float(np.abs(w[np.isfinite(w)]).max(initial=1.0)) for w in (kept, after))
-            if drawn and np.ptp(shift[np.isfinite(shift)]) < _ROUNDED * size:
+            if drawn and np.ptp(shift[np.isfinite(shift)]) < of_logs(kept, after):
                 steps.append(int(table.step[row]))
-        if len(steps) >= _FEWEST:
+        if len(steps) >= REPEATED:
             yield Finding(
                 "used_twice", "error", None, (steps[0], steps[-1]), {"times": len(steps)},
                 f"{at_steps(len(steps))} particles that were copied by their weights keep these weights: what was read "

@@ -9,8 +9,10 @@ import numpy as np
 from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
-from viz_estim.diagnosis.evidence import Case, sensor_of, tangents, tells_gain
-from viz_estim.diagnosis.finding import GROSS, HALF_THE_DIGITS, SOLVABLE, Finding
+from viz_estim.diagnosis.evidence import Case, sensor_of, tells_gain
+from viz_estim.diagnosis.finding import FEWEST, GROSS, HALF_THE_DIGITS, LARGEST, TINY, Finding
+from viz_estim.diagnosis.linear import tangents
+from viz_estim.diagnosis.rounding import epsilon, sound
 
 
 def broken(case: Case) -> Iterator[Finding]:
@@ -42,7 +44,7 @@ def broken(case: Case) -> Iterator[Finding]:
         skew = np.abs(correlation - np.swapaxes(correlation, 1, 2)).max((1, 2))
         values = np.linalg.eigvalsh(0.5 * (correlation + np.swapaxes(correlation, 1, 2)))
         negative = np.minimum(values[:, 0], np.where(variance < 0, -1.0, 0.0).min(1))
-        condition = np.where(values[:, 0] > 0, values[:, -1] / np.maximum(values[:, 0], 1e-300), np.inf)
+        condition = np.where(values[:, 0] > 0, values[:, -1] / np.maximum(values[:, 0], TINY), np.inf)
         # A variance of zero is a state that is given; it tells of no combination that is.
         singular = d * np.finfo(float).eps * condition > np.sqrt(2 / T)
         for kind, figure, bad in (
@@ -64,13 +66,6 @@ def broken(case: Case) -> Iterator[Finding]:
             yield Finding("covariance", severity, None, steps, evidence, *_WORDS[kind])  # type: ignore[arg-type]
 
 
-def epsilon(values: Array) -> float:
-    """The rounding of numbers, a float32's where all of them are such, and more than a few."""
-    single = np.array_equal(values.astype(np.float32).astype(float), values, equal_nan=True)
-    single &= np.unique(values[:50]).size > values.shape[-1] ** 2
-    return float(np.finfo(np.float32 if single else float).eps)
-
-
 def claims(case: Case) -> Iterator[Finding]:
     """An update that leaves less than a reading can: P⁺ ≥ P − C·S⁻¹·Cᵀ for any gain (Kalman's is the best).
 
@@ -84,9 +79,8 @@ def claims(case: Case) -> Iterator[Finding]:
             continue
         mean, before = case.sequence.before(table)
         C, S = table.values["innovation.cross_cov"], table.values["innovation.cov"]
-        numbers = (before, S, table.cov, C)
-        rows = np.asarray(np.all([np.isfinite(A).all((1, 2)) for A in numbers], axis=0))
-        rows[rows] &= sound(before[rows]) & sound(S[rows]) & sound(table.cov[rows])
+        rows = np.isfinite(C).all((1, 2)) & case.sequence.sound_before(table) & case.sequence.sound[table.place]
+        rows[rows] &= sound(S[rows])
         if not rows.any():
             continue
         least = before[rows] - C[rows] @ np.linalg.solve(S[rows], np.swapaxes(C[rows], 1, 2))
@@ -100,7 +94,7 @@ def claims(case: Case) -> Iterator[Finding]:
         ], axis=0)  # fmt: skip
         shrunk = np.diagonal(before[rows][fine], axis1=1, axis2=2) / np.diagonal(least[fine], axis1=1, axis2=2)
         bad = ratio < 1 - np.minimum(HALF_THE_DIGITS * shrunk.max(1), 1 - 1 / GROSS)
-        claimed = -np.log(np.maximum(ratio[bad], 1e-300)).sum()
+        claimed = -np.log(np.maximum(ratio[bad], TINY)).sum()
         if bad.sum() > 1 and claimed > np.log1p(np.sqrt(2 / (len(ratio) * S.shape[-1]))):
             of = table.step[rows][fine][bad]
             worst = float(ratio[bad].min())
@@ -121,12 +115,6 @@ def ratios(A: Array, B: Array) -> tuple[Array, Array]:
     inside = np.asarray(np.linalg.solve(L, np.swapaxes(np.linalg.solve(L, A), 1, 2)), float)
     values = np.asarray(np.linalg.eigvalsh(symmetrised(inside)), float)
     return values[:, 0], values[:, -1]
-
-
-def rounding_of(before: Array, after: Array) -> Array:
-    """What rounding leaves of covariances after a stage (M,): their terms are products of d × d matrices as large as
-    those before it, some eight of them (`broken`)."""
-    return np.asarray(8 * before.shape[-1] * epsilon(after) * np.abs(before).max((1, 2)))
 
 
 _WORDS = {
@@ -163,17 +151,18 @@ def bounds(case: Case) -> Iterator[Finding]:
     if run.labels or "cov" not in run.ends or not case.sensors:
         return
     rows = np.flatnonzero((run.step >= case.first) & np.isfinite(run.cov).all((1, 2)))
-    if len(rows) < 20:
+    if len(rows) < FEWEST:
         return
+    # Five ends of four eighths: more of them ask for more, and no chance is in it.
     ends = rows[np.linspace(len(rows) // 2, len(rows) - 1, 5).astype(int)]
     elapsed = run.time[ends] - run.time[rows[0]]
     if not (np.diff(elapsed) > 0).all():
         return  # stamps that stand still tell of no rate
-    fastest = (elapsed[1:] / np.maximum(elapsed[:-1], 1e-12)) ** -(len(case.space.axes) - 0.5)
+    fastest = (elapsed[1:] / elapsed[:-1]) ** -(len(case.space.axes) - 0.5)
     for name in case.space.parts:
         axes, at = case.space.axes_at[name], case.space.at[name]
         sigma = np.sqrt(np.maximum(np.diagonal(run.cov, axis1=1, axis2=2)[:, axes], 0)).max(1)
-        falls = sigma[ends[1:]] / np.maximum(sigma[ends[:-1]], 1e-300)
+        falls = sigma[ends[1:]] / np.maximum(sigma[ends[:-1]], TINY)
         deaf = sigma[rows] < np.finfo(float).eps * np.abs(run.mean[rows][:, at]).max()
         if sigma[rows[0]] > 0 and ((falls < (1 - HALF_THE_DIGITS) * fastest).all() or (deaf[-1] and not deaf[0])):
             step = int(run.step[rows[int(np.argmax(deaf))]] if deaf.any() else run.step[ends[0]])
@@ -182,7 +171,7 @@ def bounds(case: Case) -> Iterator[Finding]:
                 f"the covariance of {name} collapses towards zero: the filter is sure, and deaf to what comes",
                 f"give {name} process noise: without any, each reading only makes it surer",
             )  # fmt: skip
-        gains = np.diff(sigma[ends] ** 2) / np.maximum(np.diff(elapsed), 1e-12)
+        gains = np.diff(sigma[ends] ** 2) / np.diff(elapsed)
         if (
             (gains[1:] > (1 - HALF_THE_DIGITS) * gains[:-1]).all()
             and gains[0] > 0
@@ -231,8 +220,8 @@ def unobservable(case: Case) -> Iterator[Finding]:
         mean, cov = case.sequence.before(table)
         for i, name in enumerate(space.parts):
             b = blind[:, :, i]
-            rows = (np.abs(b).max(1) > 0) & np.isfinite(cov).all((1, 2)) & (table.step >= case.first)
-            rows[rows] &= sound(cov[rows]) & sound(table.cov[rows])
+            rows = (np.abs(b).max(1) > 0) & (table.step >= case.first)
+            rows &= case.sequence.sound_before(table) & case.sequence.sound[table.place]
             if not rows.any():
                 continue
             carried = case.space.transport(mean[rows], case.space.minus(table.mean[rows], mean[rows]))
@@ -241,22 +230,16 @@ def unobservable(case: Case) -> Iterator[Finding]:
             total = float(gained.sum())
             if total > np.log1p(np.sqrt(2 / rows.sum())):
                 at = table.step[rows]
-                first = int(at[np.argmax(np.cumsum(gained) > 0.1 * total)])
-                evidence = {"information_factor": float(np.exp(min(total, 700.0))), "updates": int(rows.sum())}
+                first = int(at[np.argmax(np.cumsum(gained) > 0.1 * total)])  # about where it begins
+                evidence = {"information_factor": float(np.exp(min(total, LARGEST))), "updates": int(rows.sum())}
                 yield Finding(
                     "unobservable_update", "error" if total > np.log(GROSS) else "warning", name,
                     (first, int(at[-1])), evidence,
                     f"updates by {name} make a direction surer that {name} cannot see (as heading, by gravity): over "
-                    f"the run they claim {np.exp(min(total, 700.0)):.3g}× the information that there was",
+                    f"the run they claim {np.exp(min(total, LARGEST)):.3g}× the information that there was",
                     "check that the Jacobian is zero along that direction, and that the covariance is carried to the "
                     "tangent space at the new mean after the update",
                 )  # fmt: skip
-
-
-def sound(P: Array) -> np.ndarray:
-    """Which of covariances (M, d, d) are positive definite, and well enough conditioned to be solved with."""
-    values = np.linalg.eigvalsh(P)
-    return (values[:, 0] > 0) & (values[:, -1] < SOLVABLE * np.maximum(values[:, 0], 1e-300))
 
 
 def _information(P: Array, b: Array) -> Array:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.finding import EXPLAINED, ODDS, Finding, judge
+from viz_estim.diagnosis.finding import EXPLAINED, ODDS, TINY, Finding, by_ratio, judge
 from viz_estim.diagnosis.frames import angle_of, kabsch
 
 NOT_TURNED, TURNED_BACK = "not turned into the world's axes", "turned the wrong way into the world's axes"
@@ -23,9 +23,7 @@ def turned(part: str, truly: Array, told: Array, heading: Array | None, of: np.n
     (M,) that is known, or by one turn for all. Only where that explains it likelier, by ODDS, than a factor of
     each axis."""
     own = float(np.square(truly - told).sum())
-    by_factor = float(
-        (np.square(truly).sum(0) - (truly * told).sum(0) ** 2 / np.maximum((told**2).sum(0), 1e-300)).sum()
-    )
+    by_factor = float((np.square(truly).sum(0) - (truly * told).sum(0) ** 2 / np.maximum((told**2).sum(0), TINY)).sum())
     R = kabsch(told, truly)
     angle, about = angle_of(R)
     fixed = f"turned by {np.degrees(-angle):.0f}°" + (f" about {about}" if about else "")
@@ -38,11 +36,11 @@ def turned(part: str, truly: Array, told: Array, heading: Array | None, of: np.n
             tried.append((float(np.square(truly - should).sum()), what, 0.0))
 
     def gain(left: float, fitted: float, over: float) -> float:
-        return 0.5 * truly.size * float(np.log(over / max(left, 1e-300))) - 0.5 * fitted * float(np.log(len(truly)))
+        return 0.5 * truly.size * float(np.log(over / max(left, TINY))) - 0.5 * fitted * float(np.log(len(truly)))
 
     left, what, fitted = max(tried, key=lambda one: gain(one[0], one[2], own))
-    p = float(np.exp(-np.clip(gain(left, fitted, own), 0.0, 700.0)))
-    explained = 1 - left / max(own, 1e-300)
+    p = by_ratio(gain(left, fitted, own))
+    explained = 1 - left / max(own, TINY)
     if explained < EXPLAINED or judge(p, _TRIED, large=True) != "error" or gain(left, fitted, by_factor) < np.log(ODDS):
         return None
     return Finding(

@@ -6,8 +6,8 @@ import numpy as np
 
 from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.covariance import sound
-from viz_estim.diagnosis.finding import SHEET, Severity
+from viz_estim.diagnosis.finding import SHEET, TINY, Severity
+from viz_estim.diagnosis.rounding import sound
 
 LINE: tuple[Severity, str, str, str] = (
     "error", "twice", "the covariance after an update is what two updates by one reading leave: it is taken in twice, "
@@ -26,4 +26,4 @@ def doubled(P: Array, C: Array, S: Array, R: Array, after: Array, once: Array) -
         return False
     twice = P - 2 * C @ np.linalg.solve(D, np.swapaxes(C, 1, 2))
     size, left, told = (np.linalg.norm(A, axis=(1, 2)) for A in (after, after - twice, twice - once))
-    return bool(np.median(told / size) > SHEET**2 and np.median(left / np.maximum(told, 1e-300)) < SHEET)
+    return bool(np.median(told / size) > SHEET**2 and np.median(left / np.maximum(told, TINY)) < SHEET)

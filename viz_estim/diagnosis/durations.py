@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.evidence import Case, transitions
-from viz_estim.diagnosis.finding import GROSS, Finding
+from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.finding import GROSS, REPEATED, Finding
+from viz_estim.diagnosis.linear import transitions
 from viz_estim.recording.tables import StageTable
 
 _RATE = {"m": "m/s", "rad": "rad/s", "m/s": "m/s²"}
@@ -84,7 +85,7 @@ def carried(case: Case) -> Iterator[Finding]:
         for name, rate in pairs:
             block = F[:, axes[name], axes[rate]]
             rows = np.isfinite(block).all((1, 2)) & (dt > 0) & (by.step > case.first)
-            if rows.sum() < 3:
+            if rows.sum() < REPEATED:
                 continue
             ratio = float(np.median(np.linalg.norm(block[rows], 2, axis=(1, 2)) / dt[rows]))
             if ratio**2 > GROSS:

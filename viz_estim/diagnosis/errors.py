@@ -13,11 +13,9 @@ from viz_estim.core.distributions import chi2, norm
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis import clouds, motion
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, SOLVABLE, Finding, judge, level, times
+from viz_estim.diagnosis.finding import FEWEST, GROSS, TINY, Finding, judge, level, times
 from viz_estim.diagnosis.icp import is_registration
-
-_FEWEST = 10
-_AT_FIRST = 0.05  # of the run: how late the first error may be known that is still told of as the start's; no rate
+from viz_estim.diagnosis.rounding import sound
 
 
 def has_covariance(case: Case) -> bool:
@@ -32,7 +30,7 @@ def untested(case: Case) -> Iterator[Finding]:
     run = case.run
     if run.labels or case.sensors or run.error or run.properties.get("belief") == "Particles" or is_registration(case):
         return
-    if "mean" not in run.ends or np.isfinite(run.mean).all(1).sum() < _FEWEST:
+    if "mean" not in run.ends or np.isfinite(run.mean).all(1).sum() < FEWEST:
         return
     truth, sure = np.isfinite(run.truth).any(), has_covariance(case)
     if truth and sure:
@@ -59,7 +57,7 @@ def start(case: Case) -> Iterator[Finding]:
         return  # it starts where it is told to, and says so by no covariance
     table = run.stages.get("start")
     known_at = np.flatnonzero((run.step >= case.first) & np.isfinite(run.truth).any(1) & np.isfinite(run.mean).all(1))
-    if not len(known_at) or known_at[0] > run.row(step=case.whole[0]) + _AT_FIRST * len(run.step):
+    if not len(known_at) or not _of_the_start(case, int(known_at[0])):
         return
     k = int(known_at[0])
     mean, P = run.mean[k], run.cov[k]
@@ -67,7 +65,7 @@ def start(case: Case) -> Iterator[Finding]:
         mean, P = table.mean[-1], table.cov[-1]
     error = case.space.minus(run.truth[k], mean)
     known = np.isfinite(error) & (np.diag(P) > 0)
-    if not known.any() or not np.isfinite(P).all() or np.linalg.cond(P[known][:, known]) > SOLVABLE:
+    if not known.any() or not sound(P[np.ix_(known, known)][None])[0]:
         return
     value, dof = float(error[known] @ np.linalg.solve(P[known][:, known], error[known])), int(known.sum())
     severity = judge(float(chi2.sf(value, dof)), 1, large=bool(value > GROSS * dof))
@@ -89,6 +87,14 @@ def start(case: Case) -> Iterator[Finding]:
         )  # fmt: skip
 
 
+def _of_the_start(case: Case, row: int) -> bool:
+    """Whether the belief of a row is still the start's: the variance of no component that has a truth has been changed
+    by GROSS since, by readings or by the process. It chooses a name and decides no rate."""
+    first, now = (np.diag(case.run.cov[k]) for k in (case.run.row(step=case.whole[0]), row))
+    known = np.isfinite(case.space.minus(case.run.truth[row], case.run.mean[row]))
+    return bool(((now >= first / GROSS) & (now <= first * GROSS))[known].all())
+
+
 def by_part(case: Case) -> Iterator[Finding]:
     """Mean NEES of each part of the state, where truth is known, against χ² of as many errors as are independent.
 
@@ -107,8 +113,8 @@ def by_part(case: Case) -> Iterator[Finding]:
         error = part.minus(run.mean[:, at], run.truth[:, at])
         P = run.cov[:, axes, axes]
         rows = counts & np.isfinite(error).all(1) & np.isfinite(P).all((1, 2))
-        rows[rows] &= np.linalg.eigvalsh(P[rows])[:, 0] > 1e-12 * np.trace(P[rows], axis1=1, axis2=2)
-        if rows.sum() >= _FEWEST:
+        rows[rows] &= sound(P[rows])
+        if rows.sum() >= FEWEST:
             white = np.linalg.solve(np.linalg.cholesky(P[rows]), error[rows][..., None])[..., 0]
             found.append((name, run.step[rows], white))
     for name, steps, white in found:
@@ -137,7 +143,7 @@ def by_part(case: Case) -> Iterator[Finding]:
 def _too_sure(case: Case, name: str) -> tuple[str, str]:
     """Why a part's error may be larger than its covariance, and what to try, by the kind of estimator."""
     if case.run.properties.get("belief") == "Particles":
-        if clouds.moves(case) is not None and not list(motion.prediction(case)):
+        if clouds.moves(case) is not None and not motion.predictions(case):
             return (
                 "each step moves the particles as the truth moves, so that the readings pull the cloud away, or it is "
                 "too narrow: too few particles, or noises that are too small",
@@ -161,7 +167,7 @@ def _correlation_time(white: Array) -> float:
     T = len(white)
     spectrum = np.fft.rfft(white, 2 * T, axis=0)
     rho = np.fft.irfft((np.abs(spectrum) ** 2).sum(1))[:T]
-    rho = rho / max(rho[0], 1e-300)
+    rho = rho / max(rho[0], TINY)
     crossed = np.flatnonzero(rho <= 0)
     end = max(1, int(crossed[0])) if len(crossed) else T  # no error at all has no ρ₀ either
     tau = float(1 + 2 * (rho[1:end] ** 2).sum())

@@ -12,7 +12,7 @@ import numpy as np
 from viz_estim.core.consistency import squared_distance
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
-from viz_estim.diagnosis.finding import SOLVABLE
+from viz_estim.diagnosis.rounding import sound
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.reader import Run
 from viz_estim.recording.tables import StageTable
@@ -134,6 +134,15 @@ class Sequence:
             for row, place in enumerate(table.place.tolist()):
                 self.stage[place] = table, row
 
+    @cached_property
+    def sound(self) -> np.ndarray:
+        """Which covariances (P,) can be solved with (`rounding.sound`)."""
+        return sound(self.cov)
+
+    def sound_before(self, table: StageTable) -> np.ndarray:
+        """The same of those before each of a stage's rows (M,)."""
+        return self.sound[table.place - 1] & (table.place > 0)
+
     def before(self, table: StageTable) -> tuple[Array, Array]:
         """The mean (M, n) and covariance (M, d, d) before each of a stage's rows, NaN before the first."""
         at = table.place - 1
@@ -198,16 +207,6 @@ def sensor_of(table: StageTable) -> str | None:
     return names.pop() if len(names) == 1 else None
 
 
-def tangents(space: Space, mean: Array, moved: Array) -> list[Array]:
-    """The matrices (M, d, d) by which filters carry a covariance on when the mean (M, n) is moved (M, d).
-
-    Not at all; by the half of it, as error-state filters reset (Solà 2017, eq. 287); or to the tangent space at the new
-    mean. They differ to the first order of the move, and none is wrong.
-    """
-    shares = (0.0,) if space.flat else (0.0, 0.5, 1.0)
-    return [np.asarray(space.transport(mean, share * moved), float) for share in shares]
-
-
 def tells_reading(predicted: Array) -> bool:
     """Whether readings are there, and not their residuals in their stead."""
     return bool(np.nan_to_num(predicted).any())
@@ -215,42 +214,3 @@ def tells_reading(predicted: Array) -> bool:
 
 def units(space: Space) -> set[str]:
     return set(space.axis_units)
-
-
-def jacobians(P: Array, C: Array) -> Array:
-    """H (M, m, d) = Cᵀ·P⁻¹ of cross-covariances C (M, d, m), NaN where P is not finite; by the pseudo-inverse where
-    one is singular."""
-    H = np.full((*C.shape[:1], C.shape[2], C.shape[1]), np.nan)
-    ok = np.isfinite(P).all((1, 2)) & np.isfinite(C).all((1, 2))
-    if (np.linalg.cond(P[ok]) < SOLVABLE).all():
-        solved = np.linalg.solve(P[ok], C[ok])
-    else:
-        solved = np.linalg.pinv(P[ok], rcond=1 / SOLVABLE, hermitian=True) @ C[ok]
-    H[ok] = np.swapaxes(solved, 1, 2)
-    return H
-
-
-def transitions(case: Case, table: StageTable) -> Array | None:
-    """F (M, d, d) of a prediction: as recorded, or by least squares over its sigma points."""
-    return once(case, f"_transitions of {table.name}", lambda case: _transitions(case, table))
-
-
-def _transitions(case: Case, table: StageTable) -> Array | None:
-    if "transition" in table.values and table.values["transition"].shape[1:] == case.run.cov.shape[1:]:
-        return table.values["transition"]
-    drawn, moved = table.values.get("drawn.points"), table.values.get("propagated.points")
-    if drawn is None or moved is None or np.isnan(drawn).any() or np.isnan(moved).any():
-        return None
-    space: Any = case.space
-    mean, _ = case.sequence.before(table)
-    d, extra = len(space.axes), drawn.shape[-1] - len(space.names)
-    x = space.minus(drawn[..., : len(space.names)], mean[:, None, :])
-    if extra:  # noise among the points
-        x = np.concatenate([x, drawn[..., len(space.names) :]], axis=-1)
-    y = space.minus(moved, table.mean[:, None, :])
-    # Scaled, since states of very unlike size would lose the small ones.
-    size = np.maximum(np.abs(x).max(1, keepdims=True), 1e-12)
-    x = x / size
-    xT = np.swapaxes(x, 1, 2)
-    fit = np.linalg.pinv(xT @ x, rcond=1e-10, hermitian=True) @ (xT @ y)
-    return np.swapaxes(fit / np.swapaxes(size, 1, 2), 1, 2)[:, :, :d]

@@ -11,12 +11,16 @@ standard deviation it hides in, or readings of which each second one tells nothi
 error is no matter of the estimate but of a test against that size (a minimum-effect test; Murphy and Myors 1999): the p
 of data in which the effect *is* that large must be below the error's share too. So errors keep to 10⁻⁴ a run not only
 where a filter's model is exact, but wherever it is wrong by less than that.
+
+Noise that is coloured, which no filter's model has, makes means and slopes scatter more than white noise does. What is
+fitted is held against both (`Chance`): warnings keep to their share in either, errors to theirs where noise is white,
+and to that of warnings where it is coloured.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -77,7 +81,17 @@ SHEET = 0.05  # of a factor: what a gyro's or a wheel's data sheet leaves to a c
 HALF_THE_DIGITS = float(np.sqrt(np.finfo(float).eps))  # what is beyond is no rounding that piled up
 SOLVABLE = SHEET / (8 * float(np.finfo(float).eps))  # the condition κ by which a solve loses 8·ε·κ (Higham 2002, 7.2)
 ODDS = 20.0  # by which one cause must be likelier than another to be named alone: strong (Kass and Raftery 1995)
-_FAMILIES = 36  # statistical checks: each has an equal share, and shares it out among what it tests
+_FAMILIES = 36  # checks that may warn by chance: each has an equal share, and shares it out among what it tests
+# Readings: as many as the plainest test, that of signs, needs for an error's share, 2⁻ⁿ. Of fewer no test tells much;
+# it silences checks, and no alarm comes of it.
+FEWEST = int(np.ceil(np.log2(_FAMILIES / _BUDGET["error"])))
+REPEATED = 3  # times that something without chance in it must be seen, so that a single odd one is not the middle
+MOST = 40  # parts of one sensor, or faults at once, that are looked at: of more it costs much and tells the same
+# s over which a rate of motion is taken at least: in a shorter time noise of the truth or of an IMU would hide it, in a
+# longer one a hand turns round. It decides no rate: windows are held against how they scatter themselves.
+WINDOW = 0.1
+TINY = 1e-300  # stands for 0 below a line, and is no threshold: its ratio to any number can still be told
+LARGEST = float(np.log(np.finfo(float).max))  # logarithm of which there is a number
 
 
 def at_steps(count: int) -> str:
@@ -120,12 +134,30 @@ def level(severity: Severity, tests: int) -> float:
     return _BUDGET[severity] / _FAMILIES / max(1, tests)
 
 
-def judge(p: float, tests: int, *, large: bool | float) -> Severity | None:
+def by_ratio(gain: float) -> float:
+    """A bound on the p of a gain in log-likelihood: a ratio beyond 1/α comes with the chance α at most (Ville 1939)."""
+    return float(np.exp(-max(gain, 0.0)))
+
+
+class Chance(NamedTuple):
+    """A p by a noise that is white, as the filter takes it to be, and one that holds where it is coloured too."""
+
+    white: float
+    coloured: float
+
+
+def judge(p: float | Chance, tests: int, *, large: bool | float | Chance) -> Severity | None:
     """What a test's p makes it, of `tests` in this run: an error only where the effect is large too.
 
-    large: whether it is, or the p of data in which it is just as large as an error's.
+    large: whether it is, or the p of data in which it is just as large as an error's. Of a `Chance` errors keep to
+    their share where noise is white, and where it is coloured to that of warnings, as warnings do in both.
     """
-    if not p < level("warning", tests):  # also NaN
+    if not np.max(p) < level("warning", tests):  # also NaN
         return None
-    sure = large if isinstance(large, bool | np.bool_) else large < level("error", tests)
-    return "error" if sure and p < level("error", tests) else "warning"
+    sure = large if isinstance(large, bool | np.bool_) else _sure(large, tests)
+    return "error" if sure and _sure(p, tests) else "warning"
+
+
+def _sure(p: float | Chance, tests: int) -> bool:
+    white, coloured = p if isinstance(p, Chance) else (p, 0.0)
+    return bool(white < level("error", tests) and coloured < level("warning", tests))

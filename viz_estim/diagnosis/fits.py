@@ -11,8 +11,10 @@ import numpy as np
 from viz_estim.core.distributions import chi2, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
-from viz_estim.diagnosis.finding import level
+from viz_estim.diagnosis.finding import TINY, Chance, level
 
+# Of the run: so long that what is coloured within one is hardly so between two (Liang and Zeger 1986). Their number is
+# a matter of power alone, for with B of them a mean is t of B − 1 degrees of freedom.
 STRETCHES = 20
 
 
@@ -71,73 +73,85 @@ def white(one: Against, values: Array) -> Array:
 
 
 class Fitted(NamedTuple):
-    """A fit's coefficients (k,), their p against 0, the standard errors and degrees of freedom (k,) of that test, its
-    gain in log-likelihood, and the share that it explains."""
+    """A fit's coefficients (k,), their standard errors (2, k), by noise that is white and by stretches of the run, with
+    the degrees of freedom (2,) of their tests, its gain in log-likelihood, and the share that it explains."""
 
     coefficients: Array
-    p: Array
     error: Array
-    dof: Array
+    dof: tuple[float, float]
     gain: float
     explained: float
 
-    def p_beyond(self, i: int, size: float) -> float:
+    def p(self, i: int, size: float = 0.0) -> Chance:
         """The chance of such a coefficient where it is of this size."""
-        beyond = max(abs(float(self.coefficients[i])) - size, 0.0)
-        return float(2 * t.sf(beyond / max(float(self.error[i]), 1e-300), self.dof[i]))
+        return _chance(abs(float(self.coefficients[i])) - size, self.error[:, i], self.dof)
+
+
+def in_stretches(values: Array) -> Array:
+    """Sums (B, …) of values (M, …) over STRETCHES parts of the run, or as many as have five each."""
+    B = max(1, min(STRETCHES, len(values) // 5))
+    return np.asarray(np.add.reduceat(values, np.arange(B) * len(values) // B, axis=0))
+
+
+def _chance(off: float, error: Array, dof: tuple[float, float]) -> Chance:
+    """By t-tests of what is `off`, with each of two standard errors (2,)."""
+    scores = max(off, 0.0) / np.maximum(error, TINY)
+    return Chance(*(float(2 * t.sf(score, of)) for score, of in zip(scores, dof, strict=True)))
 
 
 def fitted(one: Against, design: Array) -> Fitted:
-    """r (M, m) on a design (M, m, k) by least squares in R; explained: the share of Σ|r|² beyond what noise may be, its
-    χ² quantile at a warning's level."""
-    X, y = white(one, design), white(one, one.r)
+    """r (M, m) on a design (M, m, k) by least squares in R."""
+    return least_squares(white(one, design), white(one, one.r), 1.0)
+
+
+def least_squares(X: Array, y: Array, variance: float = 0.0) -> Fitted:
+    """y (M, m) on X (M, m, k), whose noise has this variance at least; explained: the share of Σ|y|² beyond what such
+    noise may be, its χ² quantile at a warning's level. Zeros where X does not tell all coefficients."""
     M, m, k = X.shape
     A = np.einsum("tmi,tmj->ij", X, X)
     if not np.isfinite(A).all() or np.linalg.matrix_rank(A) < k:
-        return Fitted(np.zeros(k), np.ones(k), np.ones(k), np.ones(k), 0.0, 0.0)
+        return Fitted(np.zeros(k), np.ones((2, k)), (1.0, 1.0), 0.0, 0.0)
+    inverse = np.linalg.inv(A)
     beta = np.linalg.solve(A, np.einsum("tmi,tm->i", X, y))
     left = y - X @ beta
-    scores = np.einsum("tmi,tm->ti", X, left)
-    pieces = np.array([part.sum(0) for part in np.array_split(scores, min(STRETCHES, M // 5))])
-    B = len(pieces)
-    inverse = np.linalg.inv(A)
-    robust = inverse @ (pieces.T @ pieces) @ inverse * B / (B - 1)
-    model = inverse * max(1.0, float((left**2).mean()))
-    error = np.sqrt(np.maximum(np.diag(robust), np.diag(model)))
-    # Where the scatter over stretches is no larger than the noise's own, this is normal: a t of 19 would waste power.
-    plain = np.diag(robust) < np.diag(model) * chi2.isf(0.01, B - 1) / (B - 1)
-    error, dof = np.where(plain, np.sqrt(np.diag(model)), error), np.where(plain, M - k, B - 1)
-    p = 2 * t.sf(np.abs(beta) / np.maximum(error, 1e-300), dof)
+    pieces = in_stretches(np.einsum("tmi,tm->ti", X, left)) @ inverse
+    spread = max(len(pieces) - 1, 1)
+    model = np.diag(inverse) * max(variance, float((left**2).mean()))
+    error = np.sqrt([model, np.square(pieces).sum(0) * len(pieces) / spread])
     own, rest = float((y**2).sum()), float((left**2).sum())
-    noise = float(chi2.isf(level("warning", 1), M * m))
+    noise = variance * float(chi2.isf(level("warning", 1), M * m))
     # In the least variance that explains the rest, so that an R that is too small does not count for a cause.
-    gain = 0.5 * M * m * np.log(own / max(rest, 1e-300))
-    return Fitted(beta, p, error, dof, gain, (own - rest) / max(own - min(noise, rest), 1e-300))
+    gain = 0.5 * M * m * np.log(own / max(rest, TINY))
+    return Fitted(beta, error, (M - k, spread), gain, (own - rest) / max(own - min(noise, rest), TINY))
 
 
 class Slope(NamedTuple):
-    """A slope through zero, its standard error and degrees of freedom, and Σ of the squares that are left."""
+    """A slope through zero, its standard errors (2,) and their degrees of freedom as of `Fitted`, and Σ of the squares
+    that are left."""
 
     value: float
-    error: float
-    dof: float
+    errors: Array
+    dof: tuple[float, float]
     left: float
 
-    def p_beyond(self, size: float) -> float:
+    @property
+    def error(self) -> float:
+        """The larger one."""
+        return float(self.errors.max())
+
+    def p(self, size: float = 0.0) -> Chance:
         """The chance of such a slope where it is of this size."""
-        return float(2 * t.sf(max(abs(self.value) - size, 0.0) / max(self.error, 1e-300), self.dof))
+        return _chance(abs(self.value) - size, self.errors, self.dof)
 
 
 def slope(y: Array, x: Array) -> Slope:
-    """Of y on x (M,), with a standard error by 20 stretches of the run where that is larger."""
+    """Of y on x (M,)."""
     A = float(x @ x)
     if A <= 0:
-        return Slope(0.0, 1.0, 1.0, float(y @ y))
+        return Slope(0.0, np.ones(2), (1.0, 1.0), float(y @ y))
     slope = float(x @ y) / A
     left = y - slope * x
-    pieces = np.array([part.sum() for part in np.array_split(x * left, min(STRETCHES, len(y) // 5))])
-    B = len(pieces)
-    scatter, model = float(pieces @ pieces) * B / (B - 1) / A**2, float(left @ left) / len(y) / A
-    if scatter < model * chi2.isf(0.01, B - 1) / (B - 1):
-        return Slope(slope, float(np.sqrt(model)), len(y) - 1, float(left @ left))
-    return Slope(slope, float(np.sqrt(scatter)), B - 1, float(left @ left))
+    pieces, squares = in_stretches(x * left) / A, float(left @ left)
+    spread = max(len(pieces) - 1, 1)
+    errors = np.sqrt([squares / len(y) / A, float(pieces @ pieces) * len(pieces) / spread])
+    return Slope(slope, errors, (len(y) - 1, spread), squares)

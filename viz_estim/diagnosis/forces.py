@@ -15,16 +15,14 @@ import numpy as np
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3, Euclidean
-from viz_estim.diagnosis.axes import maps
-from viz_estim.diagnosis.clouds import WINDOW
+from viz_estim.diagnosis.axes import inverses, maps
 from viz_estim.diagnosis.directions import NOT_TURNED, TURNED_BACK
 from viz_estim.diagnosis.durations import by_biases, whole
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import EXPLAINED, ODDS, Finding, judge
+from viz_estim.diagnosis.finding import EXPLAINED, FEWEST, ODDS, TINY, WINDOW, Finding, by_ratio, judge
 from viz_estim.scenarios.imu_health import GRAVITY
 
 _UP = np.array([0.0, 0.0, GRAVITY])
-_FEWEST = 12
 _OTHERS = "; others of the list do too, for it is along one axis"
 _EXCHANGED = "gyro and accelerometer"
 
@@ -64,7 +62,7 @@ def pulled(case: Case) -> Pulled | None:
     n = max(1, round(WINDOW / max(float(np.median(run.dt[row])), 1e-9))) if len(row) else 1
     kept = np.flatnonzero(fine)
     kept = kept[: len(kept) // n * n]
-    if len(kept) // n < _FEWEST:
+    if 3 * (len(kept) // n) < FEWEST:  # numbers
         return None
     name = next(name for name in space.parts if space.at[name] == v)
     change = by.after[kept][:, v] - by.before[kept][:, v] - by_biases(case, tables[0], by, name)[kept]
@@ -80,7 +78,7 @@ def pulled(case: Case) -> Pulled | None:
 def foreseen(values: Array, left: float) -> bool:
     """Whether values (M, 3) are told by a map that leaves these squares of them, and not only made small: likelier by
     ODDS than none at all."""
-    return bool(0.5 * values.size * np.log(float(np.square(values).sum()) / max(left, 1e-300)) > np.log(ODDS))
+    return bool(0.5 * values.size * np.log(float(np.square(values).sum()) / max(left, TINY)) > np.log(ODDS))
 
 
 def _force(before: Array, after: Array, change: Array, dt: Array) -> tuple[Array, Array, Array]:
@@ -100,17 +98,20 @@ def forces(case: Case) -> Iterator[Finding]:
         return
     truly, told = found.truly, found.told
     own = float(np.square(truly - told).sum())
-    tried = [(float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title, A) for title, A in maps(3, "m/s²")]
+    tried = [
+        (float(np.square(told - truly @ back).sum()), title, A)
+        for (title, A), (_, back) in zip(maps(3, "m/s²"), inverses(3, "m/s²"), strict=True)
+    ]
     tried.append((float(np.square(told - found.turns).sum()), _EXCHANGED, np.eye(3)))
     for what, values in ((NOT_TURNED, found.plain), (TURNED_BACK, found.back)):
         tried.append((float(np.square(truly - values).sum()), what, np.eye(3)))
     left = min(one[0] for one in tried)
-    explained = 1 - left / max(own, 1e-300)
-    gain = 0.5 * truly.size * float(np.log(own / max(left, 1e-300)))
-    if explained < EXPLAINED or judge(float(np.exp(-min(gain, 700.0))), len(tried), large=True) != "error":
+    explained = 1 - left / max(own, TINY)
+    gain = 0.5 * truly.size * float(np.log(own / max(left, TINY)))
+    if explained < EXPLAINED or judge(by_ratio(gain), len(tried), large=True) != "error":
         return
     # Of those that explain it as well (a force along one axis tells nothing of the others) the least change.
-    alike = [one for one in tried if 0.5 * truly.size * np.log(one[0] / max(left, 1e-300)) < np.log(ODDS)]
+    alike = [one for one in tried if 0.5 * truly.size * np.log(one[0] / max(left, TINY)) < np.log(ODDS)]
     what = max(alike, key=lambda one: float(np.trace(one[2])))[1]
     if what not in (_EXCHANGED, NOT_TURNED, TURNED_BACK) and not foreseen(told, left):
         return

@@ -10,8 +10,10 @@ from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3, Euclidean
 from viz_estim.diagnosis.causes import Cause, listed
-from viz_estim.diagnosis.finding import GROSS
+from viz_estim.diagnosis.finding import EXPLAINED, GROSS, HALF_THE_DIGITS, TINY, by_ratio
 from viz_estim.diagnosis.fits import Against, white
+
+_ROUNDS = 10  # of a search whose steps are squared each time; what is found is held against all readings
 
 
 def turned(one: Against) -> Iterator[Cause]:
@@ -48,7 +50,7 @@ def turned_attitudes(one: Against) -> Iterator[Cause]:
 
 def _turn(one: Against, left: float, k: int, turn: str, words: str) -> Iterator[Cause]:
     own, (M, m) = float((white(one, one.r) ** 2).sum()), one.r.shape
-    gain, explained = 0.5 * M * m * float(np.log(own / max(left, 1e-300))), 1 - left / max(own, 1e-300)
+    gain, explained = 0.5 * M * m * float(np.log(own / max(left, TINY))), 1 - left / max(own, TINY)
     yield Cause(
         "units_or_axes", gain, k, _penalised(gain, k, M), own > GROSS * left,
         float(np.sqrt(max(own - left, 0.0) / (M * m))), explained,
@@ -60,7 +62,7 @@ def _turn(one: Against, left: float, k: int, turn: str, words: str) -> Iterator[
 
 def _penalised(gain: float, k: int, M: int) -> float:
     """A bound of p: the likelihood ratio, less what k fitted numbers gain by themselves (Schwarz 1978)."""
-    return float(np.exp(-np.clip(gain - 0.5 * k * np.log(M), 0.0, 700.0)))
+    return by_ratio(gain - 0.5 * k * float(np.log(M)))
 
 
 def conventions(one: Against) -> Iterator[Cause]:
@@ -75,7 +77,7 @@ def conventions(one: Against) -> Iterator[Cause]:
     for what, (z, words) in read.items():
         left = float((white(one, one.space.minus(z, one.true)) ** 2).sum())
         own = float((white(one, one.r) ** 2).sum())
-        found = listed(one, left, f"axes {what}", 1 - left / max(own, 1e-300))
+        found = listed(one, left, f"axes {what}", 1 - left / max(own, TINY))
         if found is not None:
             yield found._replace(
                 evidence=found.evidence | {"map": what},
@@ -94,7 +96,7 @@ def exchanged(one: Against, others: list[Against]) -> Iterator[Cause]:
             continue
         # Between its own readings what the other would read is a smooth curve: a line from one to the next.
         inside = (one.time >= other.time[0]) & (one.time <= other.time[-1])
-        if inside.mean() < 0.5:
+        if inside.mean() < EXPLAINED:  # else it could not explain so much
             continue
         should = np.stack([np.interp(one.time, other.time, y) for y in other.true.T], axis=-1)
         left = float((white(one, one.z - should)[inside] ** 2).sum()) / inside.mean()
@@ -102,7 +104,7 @@ def exchanged(one: Against, others: list[Against]) -> Iterator[Cause]:
             best, whose = left, other.name
     if whose is None:
         return
-    found = listed(one, best, f"axes {whose}", 1 - best / max(own, 1e-300))
+    found = listed(one, best, f"axes {whose}", 1 - best / max(own, TINY))
     if found is not None:
         yield found._replace(
             evidence=found.evidence | {"map": f"{whose} for {one.name}"},
@@ -124,12 +126,12 @@ def misplaced(one: Against) -> Iterator[Cause]:
         should = one.true.copy()
         should[:, i] = np.linalg.norm(one.position - place, axis=1)
         left = float((white(one, one.z - should) ** 2).sum())
-        gain = 0.5 * M * m * float(np.log(own.sum() / max(left, 1e-300)))
+        gain = 0.5 * M * m * float(np.log(own.sum() / max(left, TINY)))
         at, taken = (f"({', '.join(f'{v:.3g}' for v in p)}) m" for p in (place, one.places[i]))
         yield Cause(
             "units_or_axes", gain, d, _penalised(gain, d, M),
             bool(own.sum() > GROSS * left), float(np.sqrt(max(float(own.sum()) - left, 0.0) / M)),
-            1 - left / max(float(own.sum()), 1e-300),
+            1 - left / max(float(own.sum()), TINY),
             {"map": f"place {at}", "log_likelihood_gain": gain},
             f"readings of {one.axis(i)} are distances from {at}, and the filter takes them from {taken}",
             f"check the place of what {one.axis(i)} is read from, and the order of the places", True,
@@ -138,10 +140,14 @@ def misplaced(one: Against) -> Iterator[Cause]:
 
 def place_of(position: Array, distance: Array, place: Array) -> Array:
     """Where distances (M,) to positions (M, d) come from, by Gauss and Newton from a first place (d,) on."""
-    for _ in range(10):
+    for _ in range(_ROUNDS):
         away = place - position
-        length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
-        place = place + np.linalg.lstsq(away / length[:, None], distance - length, rcond=1e-6)[0]
+        length = np.maximum(np.linalg.norm(away, axis=1), TINY)
+        to = away / length[:, None]
+        step = np.linalg.lstsq(to, distance - length, rcond=HALF_THE_DIGITS)[0]
+        place = place + step
+        if np.abs(step).max() < HALF_THE_DIGITS * np.abs(away).max():
+            break
     return place
 
 
@@ -173,8 +179,8 @@ def angle_of(R: Array) -> tuple[float, str]:
         return float(np.arctan2(R[1, 0], R[0, 0])), ""
     turn = quaternions.log(quaternions.from_matrix(R))
     angle = float(np.linalg.norm(turn))
-    axis = turn / max(angle, 1e-300)
+    axis = turn / max(angle, TINY)
     near = int(np.argmax(np.abs(axis)))
-    if abs(axis[near]) > np.cos(np.radians(10)):
+    if abs(axis[near]) > np.cos(np.radians(10)):  # in words: about one axis, to ten degrees
         return angle * float(np.sign(axis[near])), "xyz"[near]
     return angle, f"({', '.join(f'{v:.2f}' for v in axis)})"

@@ -6,17 +6,18 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from viz_estim.core.distributions import norm
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, Euclidean, Product, Space, wrap
-from viz_estim.diagnosis.axes import explains, finding_of, maps, units
-from viz_estim.diagnosis.covariance import epsilon
+from viz_estim.diagnosis.axes import explains, finding_of, inverses, maps, units
 from viz_estim.diagnosis.evidence import Case, Readings, tells_reading
-from viz_estim.diagnosis.finding import GROSS, HALF_THE_DIGITS, SHEET, Finding, level
+from viz_estim.diagnosis.finding import FEWEST, GROSS, HALF_THE_DIGITS, SHEET, TINY, Finding, level
 from viz_estim.diagnosis.fits import slope
 from viz_estim.diagnosis.kinematics import imu_axes, scale
+from viz_estim.diagnosis.naming import FAR
+from viz_estim.diagnosis.rounding import epsilon
 from viz_estim.recording.layout import leaves
 
-_FAR = 3.0  # standard errors
 _TURNS = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0, "": None}  # by unit; unknown where none is told
 
 
@@ -48,11 +49,12 @@ def _by_a_turn(readings: Readings, i: int) -> set[int]:
     what S allows, while reading and expectation are both angles of the first turn: a jump that no noise makes."""
     if not isinstance(readings.space, Euclidean) or readings.z.shape != readings.residual.shape:
         return set()
-    jump, sigma = np.abs(readings.residual[:, i]), np.sqrt(readings.cov[:, i, i])
+    jump = np.abs(readings.residual[:, i])
+    noise = norm.isf(level("error", len(jump))) * np.sqrt(readings.cov[:, i, i])  # none is larger, at an error's share
     for turn in (2 * np.pi, 360.0):
-        half = 0.5 * turn + 4 * sigma
+        half = 0.5 * turn + noise
         angles = (np.abs(readings.z[:, i]) < half) & (np.abs(readings.predicted[:, i]) < half)
-        rows = (np.abs(jump - turn) < 4 * sigma) & (16 * sigma < turn) & angles
+        rows = (np.abs(jump - turn) < noise) & (4 * noise < turn) & angles
         if rows.any() and (np.abs(readings.z[:, i]).max() < half.max()):
             return set(readings.step[rows].tolist())
     return set()
@@ -151,21 +153,22 @@ def units_or_axes(case: Case) -> Iterator[Finding]:
         space = readings.space
         if not tells_reading(readings.predicted):
             continue
-        if told or not isinstance(space, Euclidean) or not 1 <= len(space.axes) <= 3 or len(readings) < 10:
+        if told or not isinstance(space, Euclidean) or not 1 <= len(space.axes) <= 3 or len(readings) < FEWEST:
             continue
         own = float(np.nansum(readings.nis))
         sound = np.isfinite(readings.nis) & np.isfinite(readings.z).all(1) & np.isfinite(readings.predicted).all(1)
         z, predicted, precision = readings.z[sound], readings.predicted[sound], np.linalg.inv(readings.cov[sound])
         best, what = np.inf, ""
         unit = space.axis_units[0]
-        for title, M in maps(len(space.axes), unit):
-            off = z - predicted @ np.linalg.inv(M).T
+        tried = inverses(len(space.axes), unit)
+        for title, back in tried:
+            off = z - predicted @ back
             value = float(np.einsum("ti,tij,tj->", off, precision, off))
             if value < best:
                 best, what = value, title
-        gain, explained = 0.5 * (own - best), 1 - best / max(own, 1e-300)
+        gain, explained = 0.5 * (own - best), 1 - best / max(own, TINY)
         nothing = float(np.einsum("ti,tij,tj->", z, precision, z))
-        sure = gain > -np.log(level("error", 60 * len(case.sensors)))
+        sure = gain > -np.log(level("error", len(tried) * len(case.sensors)))
         if (
             sure
             and explains(what, own, best, nothing, z.size)
@@ -187,7 +190,7 @@ def singled_out(z: Array, predicted: Array, precision: Array, what: str, unit: s
     if forth.value <= 0 or back.value <= 0:
         return False
     low, high = sorted((np.log(forth.value), -np.log(back.value)))
-    wide = _FAR * max(forth.error / forth.value, back.error / back.value) + SHEET
+    wide = FAR * max(forth.error / forth.value, back.error / back.value) + SHEET
     scale = 1.0 if what.startswith("axes") else units(unit)[what]
     others = [0.0 if what.startswith("axes") else np.log(scale), *(np.log(scale / f) for f in units(unit).values())]
     known = wide < np.log(GROSS) and low - wide < 0 < high + wide

@@ -9,7 +9,7 @@ import numpy as np
 from viz_estim.core.consistency import FIT
 from viz_estim.core.distributions import binom, chi2, f
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
+from viz_estim.diagnosis.finding import GROSS, REPEATED, TINY, Finding, judge, level
 from viz_estim.recording.tables import StageTable
 
 _HALF = 0.5  # of the cloud's points: the breakdown point, beyond which no estimate tells which half is right
@@ -88,8 +88,8 @@ def few_matches(case: Case) -> Iterator[Finding]:
     # The fit's own count is kept where the matches are thinned; one that failed has none.
     if fits is not None and len(fits.step) and "count" in fits.values and case.run.error is None:
         count = int(fits.values["count"].ravel()[-1])
-    severity = judge(float(binom.cdf(count, N, _HALF)), 1, large=count < 0.5 * _HALF * N)
-    if severity or count < 3:
+    severity = judge(float(binom.cdf(count, N, _HALF)), 1, large=count < _HALF / GROSS * N)
+    if severity or count < REPEATED:
         steps = int(matched.step[0]), int(matched.step[-1])
         yield Finding(
             "icp_few_matches", severity or "error", None, steps, {"matches": count, "points": N},
@@ -121,7 +121,7 @@ def rising(case: Case) -> Iterator[Finding]:
     if fits is None or len(fits.step) < 3:
         return
     rmse, count = fits.values["rmse"].ravel(), fits.values["count"].ravel()
-    ratio, dof = np.square(rmse[1:] / np.maximum(rmse[:-1], 1e-300)), _dimensions(case) * count[1:]
+    ratio, dof = np.square(rmse[1:] / np.maximum(rmse[:-1], TINY)), _dimensions(case) * count[1:]
     by_chance = f.isf(level("warning", len(ratio)), np.maximum(dof, 1), np.maximum(dof, 1))
     rises = np.flatnonzero((ratio > by_chance) & (count[1:] <= count[:-1])) + 1
     if len(rises):

@@ -11,12 +11,11 @@ from viz_estim.core.consistency import nees
 from viz_estim.core.distributions import chi2, f, norm, t
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.evidence import Case, Readings, parameter
-from viz_estim.diagnosis.finding import GROSS, Finding, judge, level
-from viz_estim.diagnosis.fits import STRETCHES
+from viz_estim.diagnosis.finding import FEWEST, GROSS, REPEATED, TINY, Finding, judge, level
+from viz_estim.diagnosis.fits import STRETCHES, in_stretches
 from viz_estim.diagnosis.icp import is_registration
 from viz_estim.diagnosis.outlying import TAIL, outlying
 
-_FEWEST = 20
 _LAGS = 10
 # The correlation ρ of neighbours in a first-order process whose mean has a variance larger by GROSS, (1 + ρ)/(1 − ρ).
 _CORRELATED = (GROSS - 1) / (GROSS + 1)
@@ -34,7 +33,7 @@ def biased(case: Case) -> Iterator[Finding]:
     tests = sum(readings.dof for readings in case.sensors.values())
     for name, readings in case.sensors.items():
         N = len(readings)
-        if N < _FEWEST:
+        if N < FEWEST:
             continue
         for i, axis in enumerate(readings.space.axes):
             values = readings.scaled[:, i]
@@ -43,8 +42,8 @@ def biased(case: Case) -> Iterator[Finding]:
             if error <= 0:
                 continue
             score = mean / error
-            stretches = np.array([piece.mean() for piece in np.array_split(values, min(STRETCHES, N // 5))])
-            apart = mean / max(float(stretches.std(ddof=1)) / np.sqrt(len(stretches)), 1e-300)
+            stretches = in_stretches(values) / in_stretches(np.ones(N))
+            apart = mean / max(float(stretches.std(ddof=1)) / np.sqrt(len(stretches)), TINY)
             below = max(0.0, 1 - _own_share(readings, i) ** 0.5 / abs(mean))  # what of it is beyond a large one
             p, p_large = (
                 float(max(2 * t.sf(k * abs(score), max(1, N / tau - 1)), 2 * t.sf(k * abs(apart), len(stretches) - 1)))
@@ -78,16 +77,12 @@ def coloured(case: Case) -> Iterator[Finding]:
     """
     for name, readings in case.sensors.items():
         N = len(readings)
-        lags = min(_LAGS, N // 5)
-        if N < _FEWEST:
+        if N < FEWEST:
             continue
-        white = readings.white - readings.white.mean(0)
-        rho = _autocorrelations(white, lags)
-        Q = N * (N + 2) * float((rho**2 / (N - np.arange(1, lags + 1))).sum())
-        p = float(chi2.sf(Q, rho.size))
+        Q, p, rho = ljung_box(readings)
         component, lag = np.unravel_index(np.argmax(np.abs(rho)), rho.shape)
         strongest = float(rho[component, lag])
-        beyond = np.arctanh(min(abs(strongest), 1 - 1e-12)) - np.arctanh(_CORRELATED)
+        beyond = np.arctanh(min(abs(strongest), 1 - np.finfo(float).eps)) - np.arctanh(_CORRELATED)
         severity = judge(p, len(case.sensors), large=float(rho.size * norm.sf(beyond * np.sqrt(N - 3))))
         if severity:
             seconds = float(np.median(readings.time[lag + 1 :] - readings.time[: -(lag + 1)]))
@@ -100,6 +95,16 @@ def coloured(case: Case) -> Iterator[Finding]:
                 evidence,
                 *_colour(name, strongest, seconds, float(np.median(readings.nis)) < chi2.median(readings.dof)),
             )
+
+
+def ljung_box(readings: Readings) -> tuple[float, float, Array]:
+    """Q of the whitened innovations, the chance of it, and their autocorrelations (m, lags). The number of lags changes
+    the power and no rate: Q is χ²(lags·m) for any."""
+    N, white = len(readings), readings.white - readings.white.mean(0)
+    lags = min(_LAGS, N // 5)
+    rho = _autocorrelations(white, lags)
+    Q = N * (N + 2) * float((rho**2 / (N - np.arange(1, lags + 1))).sum())
+    return Q, float(chi2.sf(Q, rho.size)), rho
 
 
 def _colour(name: str, strongest: float, seconds: float, small: bool) -> tuple[str, str]:
@@ -125,7 +130,7 @@ def _colour(name: str, strongest: float, seconds: float, small: bool) -> tuple[s
 
 def _autocorrelations(values: Array, lags: int = _LAGS) -> Array:
     """(m, lags) of N centred values (N, m)."""
-    total = np.maximum((values**2).sum(0), 1e-300)
+    total = np.maximum((values**2).sum(0), TINY)
     return np.stack([(values[k:] * values[:-k]).sum(0) / total for k in range(1, lags + 1)], axis=-1)
 
 
@@ -134,7 +139,7 @@ def outliers(case: Case) -> Iterator[Finding]:
     all, once these are brought to their median."""
     for name, readings in case.sensors.items():
         N, dof = len(readings), readings.dof
-        if N < _FEWEST:
+        if N < FEWEST:
             continue
         far, bound, p = outlying(readings.nis, dof, len(case.sensors))
         count, scale = int(far.sum()), bound / chi2.isf(TAIL, dof)
@@ -175,26 +180,25 @@ def gate_name(case: Case, name: str) -> str:
 def diverged(case: Case) -> Iterator[Finding]:
     """NIS leaves for good: from some step on every block of readings lies above its χ² band, after some that did not.
 
-    A block's sum is χ²(B·dof); a row of n such blocks at the level α each has the probability αⁿ. By then innovations
-    are twice as large, and NIS larger than before by a factor that is beyond GROSS for sure, by F.
+    A block's sum is χ²(B·dof); a row of n such blocks at the level TAIL each has the probability TAILⁿ. By then
+    innovations are twice as large, and NIS larger than before by a factor that is beyond GROSS for sure, by F.
     """
     for name, readings in case.sensors.items():
         block, blocks = _blocks(readings)
-        if blocks < 6:
+        if len(readings) < FEWEST:
             continue
-        alpha = 1e-3
         sums = readings.nis[-block * blocks :].reshape(blocks, block).sum(1)
-        high = sums > chi2.isf(alpha, block * readings.dof)
+        high = sums > chi2.isf(TAIL, block * readings.dof)
         low = np.flatnonzero(~high)
         start = int(low[-1]) + 1 if len(low) else 0
         row = blocks - start
-        growth = float(sums[start:].mean() / max(sums[:start].mean(), 1e-300)) if 0 < start < blocks else 0.0
-        if row < 3 or growth < GROSS**2:
+        growth = float(sums[start:].mean() / max(sums[:start].mean(), TINY)) if 0 < start < blocks else 0.0
+        if growth < GROSS**2:
             continue
         n = block * readings.dof
         at = len(readings) - block * (blocks - start)
         p_large = float(f.sf(growth / GROSS, n * row, n * start))
-        severity = judge(blocks * alpha**row, len(case.sensors), large=p_large)
+        severity = judge(blocks * TAIL**row, len(case.sensors), large=p_large)
         if severity:
             steps = int(readings.step[at]), int(readings.step[-1])
             evidence = {"onset_step": steps[0], "onset_s": float(readings.time[at]), "growth": growth}
@@ -217,7 +221,7 @@ def lost(case: Case) -> Iterator[Finding]:
     """The error leaves for good: from some step to the end every NEES is beyond χ²'s quantile of an error's level.
 
     Whatever came before, that takes the last step to be beyond it, which chance does with that level. An error where
-    it doubles the mean NEES of the whole run; no finding where it is shorter than a twentieth of it, for a run may end
+    it doubles the mean NEES of the whole run; no finding where it is shorter than one of STRETCHES, for a run may end
     anywhere.
     """
     run = case.run
@@ -225,12 +229,12 @@ def lost(case: Case) -> Iterator[Finding]:
         return
     values, dof = nees(run.space, run.mean, run.cov, run.truth)
     rows = np.flatnonzero(np.isfinite(values) & (run.step >= case.first))
-    if len(rows) < _FEWEST:
+    if len(rows) < FEWEST:
         return
     inside = np.flatnonzero(values[rows] <= chi2.isf(level("error", 1), dof))
     start = int(inside[-1]) + 1 if len(inside) else 0
     lasting = len(rows) - start
-    if lasting < max(3, len(rows) // 20):
+    if lasting < max(REPEATED, len(rows) // STRETCHES):
         return
     large = float((values[rows[start:]] - dof).sum()) > (GROSS - 1) * dof * len(rows)
     steps = int(run.step[rows[start]]), int(run.step[rows[-1]])

@@ -7,18 +7,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from viz_estim.core import quaternions
-from viz_estim.core.distributions import t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO3
 from viz_estim.diagnosis.axes import explains, finding_of, maps, units
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, SOLVABLE, Finding, judge, level
-from viz_estim.diagnosis.fits import STRETCHES
+from viz_estim.diagnosis.finding import FEWEST, GROSS, ODDS, SHEET, TINY, WINDOW, Finding, judge, level
+from viz_estim.diagnosis.fits import STRETCHES, least_squares
 from viz_estim.diagnosis.naming import likeliest, of_motion
 from viz_estim.diagnosis.sensors import Imu, imu
 from viz_estim.scenarios.imu_health import GRAVITY
 
-_WINDOW = 0.1  # s over which gravity's turn is compared with the gyro's
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -48,14 +46,14 @@ def imu_axes(case: Case) -> Iterator[Finding]:
     of_rate, of_force = ([float(left.sum()) for left in those] for those in (left_by_rate, left_by_force))
     length = float(np.median(np.linalg.norm(both.force, axis=1)))
     least = min(*of_rate, *of_force)
-    variance = max(least, 1e-12) / change.size
+    variance = max(least, TINY) / change.size
     pushes = _dependent(min((*left_by_rate, *left_by_force), key=lambda left: float(left.sum())))
-    gain, explained = 0.5 * (own - least) / variance / pushes, 1 - least / max(own, 1e-300)
+    gain, explained = 0.5 * (own - least) / variance / pushes, 1 - least / max(own, TINY)
     nothing = float(np.square(change).sum())  # what no turn at all would leave: a map that is no better is none
     if gain > -np.log(level("error", 2 * len(candidates))):
         blamed = _blamed(case, both)
         # Another map of the other sensor, where that is as likely: their windows share pushes of the hand.
-        alike = 0.5 * change.size / pushes * np.log(min(of_force) / max(least, 1e-300)) < np.log(ODDS)
+        alike = 0.5 * change.size / pushes * np.log(min(of_force) / max(least, TINY)) < np.log(ODDS)
         if blamed == "accel" and alike:
             name, what = "accel", candidates[int(np.argmin(of_force))][0]
         else:
@@ -71,7 +69,7 @@ def imu_axes(case: Case) -> Iterator[Finding]:
 def scale(case: Case) -> Iterator[Finding]:
     """ġ = −(s∘ω) × g: the factor s of each axis of the gyro, or of all three, by least squares over the windows.
 
-    Errors of its variance by 20 stretches of the run (Liang and Zeger 1986), so that a push of the hand counts once.
+    Its errors by stretches of the run too, so that a push of the hand counts once.
     Told where s is further from 1 than 5 %, by a t-test against that: what a data sheet leaves to a calibration.
     """
     both = imu(case.run)
@@ -80,46 +78,29 @@ def scale(case: Case) -> Iterator[Finding]:
         return
     turn, middle, change, steps = pieces
     axes = np.stack([-np.cross(turn[:, [i]] * np.eye(3)[i], middle) for i in range(3)], axis=-1)  # (W, 3, 3)
-    found = [one for X in (axes.sum(-1, keepdims=True), axes) for one in _slopes(X, change)]
-    if not found:
-        return
-    s, p = min(found, key=lambda one: one[1])
+    fits = [least_squares(X, change - X.sum(-1)) for X in (axes.sum(-1, keepdims=True), axes)]  # on s − 1
+    found = [(1 + float(s), fit.p(i, SHEET)) for fit in fits for i, s in enumerate(fit.coefficients)]
+    k, (s, p) = min(enumerate(found), key=lambda one: max(one[1][1]))
     severity = judge(p, len(found), large=True)
     if severity and s > 0:
-        k = next(k for k, one in enumerate(found) if one[1] == p)
         which = "gyro" if k == 0 else f"gyro's {'xyz'[k - 1]}"
         names = likeliest(1 / s, of_motion("rad", 0.0))
         as_if = f": {', or '.join(names)}" if names else ": its sensitivity is another one"
         yield Finding(
             "units_or_axes", severity, "gyro", steps,
-            {"map": f"a factor of {1 / s:.3g}", "p": p, "factors": [1 / one[0] for one in found]},
+            {"map": f"a factor of {1 / s:.3g}", "p": max(p), "factors": [1 / one[0] for one in found]},
             f"the {which} reads {1 / s:.3g}× the turn that gravity shows{as_if}",
             f"divide the {which} by {1 / s:.3g}, or calibrate it (`viz-estim calibrate imu`)",
         )  # fmt: skip
-
-
-def _slopes(X: Array, change: Array) -> list[tuple[float, float]]:
-    """The coefficients of change (W, 3) on X (W, 3, k), and the p of each if it is 5 % off 1 at most."""
-    A = np.einsum("wki,wkj->ij", X, X)
-    if not np.isfinite(A).all() or np.linalg.cond(A) > SOLVABLE:
-        return []
-    inverse = np.linalg.inv(A)
-    s = inverse @ np.einsum("wki,wk->i", X, change)
-    scores = np.einsum("wki,wk->wi", X, change - X @ s)
-    parts = np.array([part.sum(0) for part in np.array_split(scores, STRETCHES)])
-    robust = inverse @ (parts.T @ parts) @ inverse * STRETCHES / (STRETCHES - 1)
-    error = np.sqrt(np.maximum(np.diag(robust), np.finfo(float).tiny))
-    p = 2 * t.sf(np.maximum(np.abs(s - 1) - SHEET, 0) / error, STRETCHES - 1)
-    return list(zip(s.tolist(), p.tolist(), strict=True))
 
 
 def _windows(case: Case, both: Imu) -> tuple[Array, Array, Array, tuple[int, int]] | None:
     """By window: the gyro's turn (W, 3) rad, gravity's unit direction (W, 3) and its change (W, 3); frozen times are
     left out, as the readings of the filter's sensors are."""
     time = case.run.time[both.rows]
-    n = max(2, round(_WINDOW / max(float(np.median(np.diff(time))), 1e-6)))
+    n = max(2, round(WINDOW / max(float(np.median(np.diff(time))), 1e-6)))
     W = len(time) // n
-    if W < 12:
+    if W < FEWEST:
         return None
     force = both.force[: W * n].reshape(W, n, 3).mean(1)
     force = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-9)
@@ -130,7 +111,7 @@ def _windows(case: Case, both: Imu) -> tuple[Array, Array, Array, tuple[int, int
     at = case.run.step[both.rows]
     fine = np.asarray(np.array([int(step) in read for step in at[: W * n]]).reshape(W, n).all(axis=1))
     fine = fine[1:] & fine[:-1]
-    if fine.sum() < 12:
+    if fine.sum() < FEWEST:
         return None
     middle, change = 0.5 * (force[1:] + force[:-1]), force[1:] - force[:-1]
     return turn[fine], middle[fine], change[fine], (int(at[0]), int(at[-1]))
@@ -145,7 +126,7 @@ def _dependent(left: Array) -> float:
     """How many windows share one push of the hand: 1 + 2·Σρₖ of the squares (W,) that are left, up to the first
     ρₖ ≤ 0 (Geyer 1992)."""
     about = left - left.mean()
-    rho = np.correlate(about, about, "full")[len(left) - 1 :] / max(float(about @ about), 1e-300)
+    rho = np.correlate(about, about, "full")[len(left) - 1 :] / max(float(about @ about), TINY)
     return float(1 + 2 * rho[1 : int(np.argmax(rho <= 0))].sum()) if (rho <= 0).any() else float(len(left))
 
 
@@ -160,7 +141,7 @@ def _blamed(case: Case, both: Imu) -> str:
                 up = quaternions.rotate(quaternions.conjugate(truth[known]), _UP)
                 seen = both.force[known] / np.linalg.norm(both.force[known], axis=1, keepdims=True)
                 return _upright(seen.T @ up / len(up))
-    level_at_rest = both.force[: max(1, len(both.force) // 20)].mean(0)
+    level_at_rest = both.force[: max(1, len(both.force) // STRETCHES)].mean(0)
     return _upright(np.outer(level_at_rest / np.linalg.norm(level_at_rest), _UP))
 
 

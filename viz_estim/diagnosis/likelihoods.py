@@ -16,13 +16,15 @@ import scipy
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean, Space
-from viz_estim.diagnosis.covariance import epsilon
 from viz_estim.diagnosis.evidence import Case
+from viz_estim.diagnosis.finding import FEWEST, TINY
 from viz_estim.diagnosis.fits import Against
 from viz_estim.diagnosis.frames import place_of
+from viz_estim.diagnosis.rounding import epsilon
 from viz_estim.recording.layout import leaves
 from viz_estim.recording.tables import StageTable
 
+# How far is searched: what is found must give all likelihoods to rounding, which no other model does by chance.
 _STEPS, _PARTICLES = 12, 80  # that the model is fitted to
 _STARTS, _ROUNDS = 24, 60
 
@@ -40,7 +42,7 @@ def by_particles(case: Case, attitude: Array | None) -> Iterator[Against]:
     truth = run.truth[rows][:, at]
     fine = (table.step >= case.first) & np.isfinite(truth).all(1)
     fine &= np.all([np.isfinite(z[rows]).all(1) for z in readings.values()], axis=0)
-    if fine.sum() < 30:
+    if fine.sum() < FEWEST:
         return
     z = {name: values[rows][fine] for name, values in readings.items()}
     p, logs, weights = _clouds(case, table, fine, at)
@@ -91,7 +93,7 @@ def _of_positions(p: Array, logs: Array, z: Array) -> float | None:
     """σ² of log-likelihoods c − |z − p|²/2σ²."""
     x = -0.5 * ((p - z[:, None, :]) ** 2).sum(-1)
     x, y = x - x.mean(1, keepdims=True), logs - logs.mean(1, keepdims=True)
-    slope = float((x * y).sum() / max(float((x * x).sum()), 1e-300))
+    slope = float((x * y).sum() / max(float((x * x).sum()), TINY))
     exact = np.sqrt(np.mean((y - slope * x) ** 2)) < _rounding(logs) * y.std()
     return 1 / slope if exact and slope > 0 else None
 
@@ -117,7 +119,7 @@ def _of_distances(p: Array, logs: Array, z: Array, truth: Array) -> tuple[Array,
         away = p[..., None, :] - numbers[: s * d].reshape(s, d)
         distance = np.linalg.norm(away, axis=-1)
         off = z[:, None, :] - distance
-        return np.exp(numbers[s * d :]), off, away / np.maximum(distance, 1e-300)[..., None]
+        return np.exp(numbers[s * d :]), off, away / np.maximum(distance, TINY)[..., None]
 
     def missed(numbers: Array) -> Array:
         precision, off, _ = taken(numbers)

@@ -12,9 +12,7 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.registration import moved, to_pose
 from viz_estim.diagnosis.axes import maps
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, Finding, judge
-
-_FEWEST = 30  # points of each cloud
+from viz_estim.diagnosis.finding import FEWEST, GROSS, Finding, judge
 
 
 def clouds(case: Case) -> tuple[Array, Array, float] | None:
@@ -37,7 +35,7 @@ def clouds(case: Case) -> tuple[Array, Array, float] | None:
             R, t = to_pose(state)
             X.update(zip(i.astype(int).tolist(), (source - t) @ R, strict=True))
             Y.update(zip(j.astype(int).tolist(), target, strict=True))
-    if min(len(X), len(Y)) < _FEWEST:
+    if min(len(X), len(Y)) < FEWEST:
         return None
     return np.array(list(X.values())), np.array(list(Y.values())), last
 
@@ -46,7 +44,7 @@ def _of_the_scene(case: Case) -> tuple[Array, Array] | None:
     """The one cloud (N, d) that moves and the one (M, d) that stands, whole; None where there are not just these."""
     d = 2 if len(case.space.axes) == 3 else 3
     found = sorted(case.run.clouds.values(), key=lambda cloud: not cloud[1])
-    if [moves for _, moves in found] != [True, False] or min(len(points) for points, _ in found) < _FEWEST:
+    if [moves for _, moves in found] != [True, False] or min(len(points) for points, _ in found) < FEWEST:
         return None
     return found[0][0][:, :d], found[1][0][:, :d]
 

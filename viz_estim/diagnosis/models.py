@@ -17,14 +17,15 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.diagnosis.evidence import Case, tells_gain
-from viz_estim.diagnosis.finding import GROSS, HALF_THE_DIGITS, SOLVABLE, Finding, Severity
+from viz_estim.diagnosis.finding import FEWEST, GROSS, HALF_THE_DIGITS, TINY, Finding, Severity
+from viz_estim.diagnosis.linear import jacobians
+from viz_estim.diagnosis.rounding import of_stamps, rounding_of
 
 # The share of its model's change by which a Jacobian is wrong that makes H·P·Hᵀ wrong by GROSS: (1 + s)² = 2.
 _LARGE = GROSS**0.5 - 1
 # Of the squares of what a sampled prediction leaves, n' − n of two draws, the motion in between holds n and not n': it
 # explains at most a half, while it explains all that a wrong Jacobian leaves.
 _HALF = 0.5
-_FEWEST = 10
 
 
 def measured(case: Case) -> Iterator[Finding]:
@@ -34,12 +35,11 @@ def measured(case: Case) -> Iterator[Finding]:
             continue  # sigma points have no Jacobian that could be wrong
         space = table.spaces["innovation"]
         assert isinstance(space, Product)
-        mean, cov = case.sequence.before(table)
-        rows = np.flatnonzero(np.isfinite(cov).all((1, 2)) & (table.step >= case.first))
-        rows = rows[np.linalg.cond(cov[rows]) < SOLVABLE]
-        if len(rows) < _FEWEST:
+        mean, _ = case.sequence.before(table)
+        rows = np.flatnonzero(case.sequence.sound_before(table) & (table.step >= case.first))
+        if len(rows) < FEWEST:
             continue
-        H = np.swapaxes(np.linalg.solve(cov[rows], table.values["innovation.cross_cov"][rows]), 1, 2)
+        H = jacobians(case, table)[rows]
         moved = case.space.minus(mean[rows[1:]], mean[rows[:-1]])
         seen = space.minus(
             table.values["innovation.predicted"][rows[1:]], table.values["innovation.predicted"][rows[:-1]]
@@ -71,7 +71,7 @@ def _left(change: Array, expected: Array, may: Array, largest: float) -> tuple[f
     size = np.linalg.norm(change, axis=1)
     missed = np.linalg.norm(np.maximum(np.abs(change - expected) - may, 0.0), axis=1)
     rows = (size > HALF_THE_DIGITS * max(largest, 1.0)) & (np.linalg.norm(may, axis=1) < _HALF * size)
-    if rows.sum() < _FEWEST:
+    if rows.sum() < FEWEST:
         return 0.0, 0
     return float(np.median(missed[rows] / size[rows])), int(rows.sum())
 
@@ -92,13 +92,13 @@ def predicted(case: Case) -> Iterator[Finding]:
     """
     run = case.run
     for table in run.stages.values():
-        if not {"transition", "noise"} <= table.values.keys() or len(table.step) < _FEWEST:
+        if not {"transition", "noise"} <= table.values.keys() or len(table.step) < FEWEST:
             continue
         F, Q = table.values["transition"], table.values["noise"]
         before, _ = case.sequence.before(table)
         row = np.searchsorted(run.step, table.step)
         alike = _alike(case, row) & np.isfinite(before[1:]).all(1) & np.isfinite(before[:-1]).all(1)
-        if alike.sum() < _FEWEST:
+        if alike.sum() < FEWEST:
             continue
         moved = case.space.minus(before[1:], before[:-1])[alike]
         change = case.space.minus(table.mean[1:], table.mean[:-1])[alike]
@@ -107,7 +107,7 @@ def predicted(case: Case) -> Iterator[Finding]:
         rest = change - expected
         rest = np.sign(rest) * np.maximum(np.abs(rest) - may, 0.0)
         values, vectors = np.linalg.eigh(2 * Q[1:][alike])
-        held = values > 1e-12 * np.maximum(values[:, -1:], 1e-300)
+        held = values > rounding_of(Q[1:][alike], Q)[:, None]
         white = np.einsum("mij,mi->mj", vectors, rest) / np.sqrt(np.where(held, values, np.inf))
         ratio = float(np.median((white**2).sum(1) / np.maximum(held.sum(1), 1)))
         unfelt = np.sqrt(2 / max(int(held.sum()), 1))
@@ -146,7 +146,7 @@ def _alike(case: Case, row: np.ndarray) -> np.ndarray:
     What is read and no update takes in may be a control too.
     """
     run = case.run
-    alike = np.abs(np.diff(run.dt[row])) <= 1e-9 + 1e-6 * run.dt[row][1:]
+    alike = np.abs(np.diff(run.dt[row])) <= of_stamps(run)
     for name, values in run.inputs.items():
         sensor = name.removeprefix("z.").partition("/")[0]
         if name == "control" or (name.startswith("z.") and sensor not in case.sensors):
@@ -156,11 +156,11 @@ def _alike(case: Case, row: np.ndarray) -> np.ndarray:
 
 def _follows(rest: Array, moved: Array) -> float:
     """The share of what is left (M, d) that a constant matrix times the motion (M, d) explains: R² of least squares."""
-    scale = np.maximum(np.abs(rest).max(0), 1e-300)
+    scale = np.maximum(np.abs(rest).max(0), TINY)
     rest = rest / scale
-    fit, *_ = np.linalg.lstsq(moved / np.maximum(np.abs(moved).max(0), 1e-300), rest, rcond=None)
-    left = rest - (moved / np.maximum(np.abs(moved).max(0), 1e-300)) @ fit
-    return float(1 - (left**2).sum() / max((rest**2).sum(), 1e-300))
+    fit, *_ = np.linalg.lstsq(moved / np.maximum(np.abs(moved).max(0), TINY), rest, rcond=None)
+    left = rest - (moved / np.maximum(np.abs(moved).max(0), TINY)) @ fit
+    return float(1 - (left**2).sum() / max((rest**2).sum(), TINY))
 
 
 def _wrong(what: str, severity: Severity, sensor: str | None, steps: tuple[int, int], left: float, of: str) -> Finding:

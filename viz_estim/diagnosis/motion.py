@@ -10,17 +10,35 @@ import numpy as np
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, Euclidean, wrap
 from viz_estim.diagnosis import clouds, directions, forces
-from viz_estim.diagnosis.against import FEWEST
 from viz_estim.diagnosis.against import slip as bound
-from viz_estim.diagnosis.axes import maps
+from viz_estim.diagnosis.axes import inverses, maps
 from viz_estim.diagnosis.durations import composed, whole
-from viz_estim.diagnosis.evidence import Case, transitions
-from viz_estim.diagnosis.finding import EXPLAINED, ODDS, SHEET, Finding, judge
+from viz_estim.diagnosis.evidence import Case, once
+from viz_estim.diagnosis.finding import (
+    EXPLAINED,
+    FEWEST,
+    GROSS,
+    HALF_THE_DIGITS,
+    ODDS,
+    SHEET,
+    TINY,
+    WINDOW,
+    Chance,
+    Finding,
+    by_ratio,
+    judge,
+)
 from viz_estim.diagnosis.fits import slope
+from viz_estim.diagnosis.linear import transitions
 from viz_estim.diagnosis.naming import SIGNS, likeliest, named, of_motion
+from viz_estim.scenarios.imu_health import GRAVITY
 
-_GRAVITY = 9.81  # m/s²
 _WORLD = "the world's axes"
+
+
+def predictions(case: Case) -> list[Finding]:
+    """What `prediction` finds, once for whoever asks."""
+    return once(case, "_motion", lambda case: list(prediction(case)))
 
 
 def prediction(case: Case) -> Iterator[Finding]:
@@ -55,7 +73,8 @@ def prediction(case: Case) -> Iterator[Finding]:
     ok = (at > 0) & (step > case.first)
     now, past = run.truth[at], run.truth[np.maximum(at - 1, 0)]
     error, after = case.space.minus(past, before), case.space.minus(now, by.after)
-    needed = np.asarray((np.abs(np.nan_to_num(F)) > 1e-12).any(0))
+    size = np.abs(np.nan_to_num(F))
+    needed = np.asarray((size > HALF_THE_DIGITS * size.max(2, keepdims=True)).any(0))  # to what F is known
     d = len(case.space.axes)
     told_of: list[tuple[float, Finding]] = []
     moving: dict[int, tuple[Array, Array, np.ndarray]] = {}
@@ -111,7 +130,7 @@ def _by_estimate(finding: Finding) -> Finding:
 
 def _turned(case: Case) -> Iterator[Finding]:
     """An attitude that is turned by other axes or units, or about the world's axes: step by step, or by window."""
-    for window in (0.0, clouds.WINDOW):
+    for window in (0.0, WINDOW):
         if (found := clouds.turns_of_means(case, window)) is not None:
             name, (of, truly, told), in_world = found
             if (finding := _turns_as(name, truly, told, of, in_world)) is not None:
@@ -121,7 +140,7 @@ def _turned(case: Case) -> Iterator[Finding]:
 
 def _elsewhere(case: Case) -> Iterator[Finding]:
     """The same in the body's axes, also of an estimate that has gone far from the truth."""
-    if (found := clouds.turns_of_means(case, clouds.WINDOW)) is not None:
+    if (found := clouds.turns_of_means(case, WINDOW)) is not None:
         name, (of, truly, told), _ = found
         one, none = np.ones(len(of)), np.zeros(len(of))  # by window, which are all as long
         told_of: list[tuple[float, Finding]] = []
@@ -158,9 +177,9 @@ def _exchanged(truly: Array, told: Array, of: np.ndarray) -> Finding | None:
     """The way ahead predicted as the turn and the turn as the way ahead, by what is left of each (M, 3)."""
     own = np.square(truly - told)[:, [0, 2]].sum(0)
     left = np.square(truly - told[:, [2, 1, 0]])[:, [0, 2]].sum(0)
-    explained = float(np.mean(1 - left / np.maximum(own, 1e-300)))
-    gain = 0.5 * len(truly) * float(np.log(own / np.maximum(left, 1e-300)).sum())
-    if explained < EXPLAINED or judge(float(np.exp(-min(gain, 700.0))), 1, large=True) != "error":
+    explained = float(np.mean(1 - left / np.maximum(own, TINY)))
+    gain = 0.5 * len(truly) * float(np.log(own / np.maximum(left, TINY)).sum())
+    if explained < EXPLAINED or judge(by_ratio(gain), 1, large=True) != "error":
         return None
     return Finding(
         "process_model", "error", None, (int(of[0]), int(of[-1])),
@@ -194,17 +213,18 @@ def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Ar
     own = float(np.square(truly - told).sum())
     # In what was predicted, whose size stays as it is: a unit that makes it small explains nothing by that.
     tried = [
-        (float(np.square(told - truly @ np.linalg.inv(A).T).sum()), title, told @ A.T) for title, A in maps(3, "rad/s")
+        (float(np.square(told - truly @ back).sum()), title, told @ A.T)
+        for (title, A), (_, back) in zip(maps(3, "rad/s"), inverses(3, "rad/s"), strict=True)
     ]
     if in_world is not None:
         tried.append((float(np.square(truly - in_world).sum()), _WORLD, in_world))
     best, what, mapped = min(tried, key=lambda one: one[0])
-    gain, explained = 0.5 * truly.size * np.log(own / max(best, 1e-300)), 1 - best / max(own, 1e-300)
+    gain, explained = 0.5 * truly.size * np.log(own / max(best, TINY)), 1 - best / max(own, TINY)
     # Either way, so that noise of neither passes for a unit that makes it small.
     back = float(np.square(truly - mapped).sum())
     if what != _WORLD and not (forces.foreseen(told, best) and forces.foreseen(truly, back)):
         return None
-    if explained < EXPLAINED or judge(float(np.exp(-min(gain, 700.0))), 60, large=True) != "error":
+    if explained < EXPLAINED or judge(by_ratio(gain), len(tried), large=True) != "error":
         return None
     if what == _WORLD:
         return Finding(
@@ -238,9 +258,9 @@ def _moves_as(
     drift, beta, back, left_drift, left_factor = steady.value, forth.value, aback.value, steady.left, forth.left
     ends = 1 / (1 + beta) if beta != -1 else np.inf, 1 + back
     by_factor = left_factor < left_drift
-    share = 1 - min(left_factor, left_drift) / max(float((w**2).sum()), 1e-300)
-    explains = abs(beta) * float(np.abs(told).mean()) if by_factor else abs(drift)
-    if explains < 2 * float(np.quantile(slip, 0.95)):
+    share = 1 - min(left_factor, left_drift) / max(float((w**2).sum()), TINY)
+    explains = abs(beta) * float(np.sqrt(np.mean(told**2))) if by_factor else abs(drift)
+    if explains < GROSS * float(np.sqrt(np.mean(slip**2))):  # which bounds what it does to a slope (`truth.sensors`)
         return
     steps = int(of[0]), int(of[-1])
     if by_factor:
@@ -253,30 +273,30 @@ def _moves_as(
         factor, error = known[0] if known else min(both, key=lambda one: abs(one[0] - 1))
         if abs(np.log(factor)) < np.log1p(SHEET) if factor > 0 else False:
             return  # as good as 1
-        p = max(forth.p_beyond(0.0), aback.p_beyond(0.0))
-        severity = judge(p, tests, large=max(forth.p_beyond(SHEET), aback.p_beyond(SHEET)))
+        p, beyond = (Chance(*np.maximum(forth.p(size), aback.p(size))) for size in (0.0, SHEET))
+        severity = judge(p, tests, large=beyond)
         cause = f"{label} is predicted to move by {factor:.3g}× what it does: {named(factor, told_as, error)}"
         todo = f"its sign, its unit, its calibration (divide it by {factor:.3g})"
         todo = "change its sign" if likeliest(factor, told_as, error) in SIGNS else todo
         remedy = f"look at what moves {label}, a control or a rate: {todo}"
-        evidence: dict[str, object] = {"component": label, "factor": factor, "p": p}
+        evidence: dict[str, object] = {"component": label, "factor": factor, "p": max(p)}
     else:
-        p_drift = steady.p_beyond(0.0)
-        severity = judge(p_drift, tests, large=steady.p_beyond(SHEET * float(np.abs(told).mean())))
+        p_drift = steady.p()
+        severity = judge(p_drift, tests, large=steady.p(SHEET * float(np.abs(told).mean())))
         rate = f"{unit}²" if unit.endswith("/s") else f"{unit}/s"
         cause = (
             f"the prediction misses a steady {drift:+.3g} {rate} of {label}: what moves it, a control or a rate, has "
             "a bias, or a force is missing from the model"
         )
-        if 0.5 * len(w) * np.log(left_factor / max(left_drift, 1e-300)) < np.log(ODDS):  # it was always told the same
+        if 0.5 * len(w) * np.log(left_factor / max(left_drift, TINY)) < np.log(ODDS):  # it was always told the same
             turned = likeliest(ends[0], of_motion(unit, 0.0), forth.error * ends[0] ** 2) in SIGNS
             it = "its sign is wrong" if turned else f"it moves by {ends[0]:.3g}× what it does"
             cause += f"; or {it}, which looks alike at one speed"
         remedy = f"calibrate that bias ({drift:+.3g} {rate}), or add it to the state and let the filter estimate it"
         for times, what in ((1, "not added, or added twice"), (2, "added with the wrong sign")):
-            if rate == "m/s²" and abs(abs(drift) / (times * _GRAVITY) - 1) < SHEET:
+            if rate == "m/s²" and abs(abs(drift) / (times * GRAVITY) - 1) < SHEET:
                 cause += f"; as much as where gravity is {what}"
                 remedy = f"check the sign of gravity and that it is there once: a = R·f + (0, 0, −9.81); else {remedy}"
-        evidence = {"component": label, "drift": drift, "unit": rate, "p": p_drift}
+        evidence = {"component": label, "drift": drift, "unit": rate, "p": max(p_drift)}
     if severity:
         yield share, Finding("process_model", severity, None, steps, evidence | {"against": "truth"}, cause, remedy)

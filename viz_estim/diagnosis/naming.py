@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from viz_estim.diagnosis.axes import units
-from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET
+from viz_estim.diagnosis.finding import GROSS, ODDS, SHEET, TINY
 
-_FAR = 3.0  # standard deviations: one of 370 right names is lost by it
+FAR = 3.0  # standard deviations: one of 370 right names is lost by it
 _CALIBRATED = 0.5 * SHEET  # of a factor, one standard deviation
 
 
@@ -25,9 +25,9 @@ def named(factor: float, known: dict[str, float], error: float = 0.0) -> str:
 def likeliest(factor: float, known: dict[str, float], error: float = 0.0) -> list[str]:
     """The names whose factor it may be, the nearest first: those within three standard deviations, of which none is
     less likely than the first by ODDS. By its logarithm, with the error of a calibration besides."""
-    scale = np.hypot(error / max(abs(factor), 1e-300), _CALIBRATED)
+    scale = np.hypot(error / max(abs(factor), TINY), _CALIBRATED)
     off = {name: (np.log(factor / value) / scale) ** 2 for name, value in known.items() if factor / value > 0}
-    near = sorted((value, name) for name, value in off.items() if value < _FAR**2)
+    near = sorted((value, name) for name, value in off.items() if value < FAR**2)
     return [name for value, name in near if 0.5 * (value - near[0][0]) < np.log(ODDS)]
 
 

@@ -11,10 +11,10 @@ from viz_estim.core.modes import moments, several
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Space
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, ODDS, Finding, at_steps, level
+from viz_estim.diagnosis.finding import FEWEST, GROSS, ODDS, REPEATED, Finding, at_steps, level
 from viz_estim.recording.tables import StageTable
 
-_LOOKED_AT = 100  # steps at most, at which modes are looked for
+_LOOKED_AT = 100  # steps at most, at which modes are looked for: each has its share of the check's rate
 
 _NEAR = 0.1  # the share of a normal cloud that lies about its mean, to be held against what does: it decides no rate
 
@@ -34,7 +34,7 @@ def collapsed(case: Case) -> Iterator[Finding]:
             if name in table.values and "states" in table.values and table.values[name].ndim == 1:
                 np.fmin.at(left, np.searchsorted(run.step, table.step), table.values[name])
     step, left = run.step[run.step >= case.first], left[run.step >= case.first]
-    dof = np.clip(left - 1, 1e-12, 1e6)  # 0 of a single one, and endless where nothing is known
+    dof = np.clip(left - 1, np.finfo(float).eps, 1 / np.finfo(float).eps)  # 0 of a single one, endless where not known
     chance = chi2.cdf(dof / GROSS, dof)
     few = (chance > 1 / ODDS) & (left < N / GROSS)
     if not few.any():
@@ -78,7 +78,7 @@ def clamped(case: Case) -> Iterator[Finding]:
             for x, x_before in zip(cloud.T, before.T, strict=True):
                 for end in (x.min(), x.max()):
                     held = x == end
-                    if held.sum() < 3 or end == x.mean():
+                    if held.sum() < REPEATED or end == x.mean():
                         continue
                     if _different(cloud[held]) > 2 and _different(x_before[held]) > 2:
                         found.append(int(table.step[row]))
@@ -132,9 +132,9 @@ def several_modes(case: Case) -> Iterator[Finding]:
             apart.append(step)
             if _hollow(run.space, states, weights) < level("warning", len(looked)):
                 empty.append(step)
-    if len(apart) > 2:
+    if len(apart) >= REPEATED:
         share = len(apart) / len(looked)
-        lasting = len(empty) > 2 and (max(empty) == looked[-1][0] or len(empty) > 0.5 * len(looked))
+        lasting = len(empty) >= REPEATED and (max(empty) == looked[-1][0] or len(empty) > 0.5 * len(looked))
         yield Finding(
             "several_modes", "warning" if lasting else "note", None, (min(apart), max(apart)),
             {"steps": len(apart) * every, "share": share, "hollow": len(empty) * every},
@@ -173,7 +173,7 @@ def far(case: Case) -> Iterator[Finding]:
         row = np.searchsorted(run.step, table.step)
         m = np.sum([np.isfinite(run.inputs[name][row]).sum(1) for name in inputs], axis=0)
         rows = np.isfinite(best) & (m > 0) & (table.step >= case.first)
-        if rows.sum() < 5:
+        if rows.sum() < FEWEST:
             continue
         top = {count: float(best[rows & (m == count)].max()) for count in np.unique(m[rows])}
         missed = 2 * (np.array([top[count] for count in m[rows]]) - best[rows])

@@ -14,9 +14,8 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Euclidean, Product
-from viz_estim.diagnosis.against import FEWEST
 from viz_estim.diagnosis.evidence import Case, tells_gain, tells_reading
-from viz_estim.diagnosis.finding import GROSS, Finding, judge
+from viz_estim.diagnosis.finding import FEWEST, GROSS, TINY, Finding, by_ratio, judge
 from viz_estim.diagnosis.recovered import distance_place
 from viz_estim.recording.layout import is_position
 
@@ -43,7 +42,7 @@ def exchanged(case: Case) -> Iterator[Finding]:
         if not others:
             continue
         left, whose = min(others)
-        p = float(np.exp(-min(0.5 * len(one.z) * np.log(own / max(left, 1e-300)), 700.0)))
+        p = by_ratio(0.5 * len(one.z) * float(np.log(own / max(left, TINY))))
         severity = judge(p, pairs, large=own > GROSS * left)
         if severity == "error":
             yield Finding(
@@ -60,7 +59,7 @@ def _left(one: Distances, place: Array) -> float:
     """Σ of the squares that z = a + c·d leaves; all of them where z falls as d grows."""
     d = np.linalg.norm(one.position - place, axis=1)
     about, z = d - d.mean(), one.z - one.z.mean()
-    c = max(float(about @ z) / max(float(about @ about), 1e-300), 0.0)
+    c = max(float(about @ z) / max(float(about @ about), TINY), 0.0)
     return float(np.square(z - c * about).sum())
 
 

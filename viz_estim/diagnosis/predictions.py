@@ -15,12 +15,11 @@ import numpy as np
 
 from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.covariance import ratios, rounding_of, sound
+from viz_estim.diagnosis.covariance import ratios
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, Severity
+from viz_estim.diagnosis.finding import GROSS, REPEATED, SHEET, TINY, Finding, Severity
+from viz_estim.diagnosis.rounding import rounding_of, sound
 from viz_estim.recording.tables import StageTable
-
-_FEWEST = 3
 
 _WAYS = {
     "transposed": (
@@ -60,16 +59,16 @@ def _of(case: Case, table: StageTable) -> Iterator[Finding]:
     rows = np.all([np.isfinite(A).all((1, 2)) for A in (F, Q, after, P)], axis=0) & (table.step >= case.first)
     right = F @ P @ np.swapaxes(F, 1, 2) + Q
     rows[rows] &= sound(symmetrised(right[rows])) & sound(symmetrised(after[rows]))
-    if rows.sum() < _FEWEST:
+    if rows.sum() < REPEATED:
         return
     earlier = np.concatenate([P[:1], after[:-1]]), case.sequence.cov[np.maximum(table.place - 2, 0)]
     F, Q, after, P, right, last, past = (A[rows] for A in (F, Q, after, P, right, *earlier))
     beyond = after - right
     off = np.abs(beyond).max((1, 2)) > rounding_of(P, after)
-    if not np.median(off) or _faded(after - Q, right - Q):
+    if not np.median(off) or _faded(after - Q, right - Q, rounding_of(P, after)):
         return
     low, high = ratios(after, right)
-    ratio = np.maximum(high, 1 / np.maximum(low, 1e-300))
+    ratio = np.maximum(high, 1 / np.maximum(low, TINY))
     told = float(np.sqrt(2 / (len(P) * P.shape[-1])))
     middle = float(np.median(ratio))
     severity: Severity = "error" if middle > GROSS else "warning"
@@ -106,15 +105,15 @@ def _of(case: Case, table: StageTable) -> Iterator[Finding]:
 def _left(after: Array, made: Array, beyond: Array) -> float:
     """The share of the deviations (M, d, d) that is left where the covariance is taken to be made in this way."""
     size = np.linalg.norm(beyond, axis=(1, 2))
-    return float(np.median(np.linalg.norm(after - np.nan_to_num(made), axis=(1, 2)) / np.maximum(size, 1e-300)))
+    return float(np.median(np.linalg.norm(after - np.nan_to_num(made), axis=(1, 2)) / np.maximum(size, TINY)))
 
 
-def _faded(A: Array, B: Array) -> bool:
-    """Whether A is c·B with one c above 1 throughout: a memory that fades is a choice (Sorenson and Sacks 1971)."""
-    c = (A * B).sum((1, 2)) / np.maximum((B * B).sum((1, 2)), 1e-300)
-    left = np.linalg.norm(A - c[:, None, None] * B, axis=(1, 2))
+def _faded(A: Array, B: Array, rounding: Array) -> bool:
+    """Whether A is c·B with one c above 1 throughout, to rounding (M,): a fading memory (Sorenson and Sacks 1971)."""
+    c = (A * B).sum((1, 2)) / np.maximum((B * B).sum((1, 2)), TINY)
+    left = np.abs(A - c[:, None, None] * B).max((1, 2))
     once = np.ptp(c) < SHEET * abs(float(np.median(c)) - 1)
-    return bool(np.median(c) > 1 and once and np.median(left / np.linalg.norm(A, axis=(1, 2))) < 1e-6)
+    return bool(np.median(c) > 1 and once and np.median(left / rounding) < 1)
 
 
 def _times(beyond: Array, Q: Array) -> float | None:
@@ -122,8 +121,8 @@ def _times(beyond: Array, Q: Array) -> float | None:
     size = (Q * Q).sum((1, 2))
     if not size.any():
         return None
-    c = (beyond * Q).sum((1, 2)) / np.maximum(size, 1e-300)
+    c = (beyond * Q).sum((1, 2)) / np.maximum(size, TINY)
     left = np.linalg.norm(beyond - c[:, None, None] * Q, axis=(1, 2))
-    if np.median(left / np.maximum(np.linalg.norm(beyond, axis=(1, 2)), 1e-300)) > SHEET:
+    if np.median(left / np.maximum(np.linalg.norm(beyond, axis=(1, 2)), TINY)) > SHEET:
         return None
     return 1 + float(np.median(c))

@@ -17,10 +17,10 @@ import numpy as np
 from viz_estim.core import quaternions
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import S2, SE2, SO2, SO3, Euclidean, Product, Space
-from viz_estim.diagnosis.finding import HALF_THE_DIGITS
+from viz_estim.diagnosis.finding import HALF_THE_DIGITS, TINY
 from viz_estim.recording.layout import leaves
 
-_ROWS = 3  # pairs for each number of a fit, at least
+_ROWS = 3  # pairs for each number of a fit, at least: two of each are left to belie it, and none does by `exact`
 
 
 class Recovered(NamedTuple):
@@ -170,7 +170,7 @@ def _line(x: Array, y: Array, at: Array) -> tuple[Array, Array, Array, Array] | 
     rows = np.asarray(np.isfinite(x).all(1) & np.isfinite(y.reshape(len(y), -1)).all(1))
     if rows.sum() < _ROWS * x.shape[1]:
         return None
-    size = np.maximum(np.abs(x[rows]).max(0), 1e-300)
+    size = np.maximum(np.abs(x[rows]).max(0), TINY)
     U, s, Vt = np.linalg.svd(x[rows] / size, full_matrices=False)
     told = s > HALF_THE_DIGITS * s[0]  # in other directions the estimates never moved
     coefficients = (Vt[told].T / s[told]) @ (U[:, told].T @ y[rows])

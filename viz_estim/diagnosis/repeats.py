@@ -8,12 +8,11 @@ import numpy as np
 
 from viz_estim.core.distributions import binom
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.finding import Finding, judge
-from viz_estim.diagnosis.sensors import continuous, given, runs
+from viz_estim.diagnosis.finding import FEWEST, Finding, judge
+from viz_estim.diagnosis.sensors import continuous, given, held
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.reader import Run
 
-_FEWEST = 10  # of readings of 52 bits: by then they are the same in all but name
 _HELD = "a reading is held and given again until the next one comes"
 
 
@@ -43,12 +42,12 @@ def used_twice(run: Run) -> Iterator[Finding]:
         if name in twice or not continuous(values):
             continue
         same = (np.diff(values, axis=0) == 0).all(1)
-        short = np.zeros(len(same), bool)
-        for first, last in runs(same):
-            short[first : last + 1] = (last - first) < len(same) / 10
+        short = same.copy()
+        for first, last in held(same, len(readings)):  # stuck
+            short[first : last + 1] = False
         again = int(((values[2:] == values[:-2]).all(1) & ~same[1:]).sum())
-        held, q = int(short.sum()), float(short.mean())
-        if judge(float(binom.sf(held - 1, held + again, 1 / (2 - q))), len(readings), large=True) == "error":
+        count, q = int(short.sum()), float(short.mean())
+        if judge(float(binom.sf(count - 1, count + again, 1 / (2 - q))), len(readings), large=True) == "error":
             at = np.flatnonzero(short) + 1
             steps_held = int(run.step[rows[at[0]]]), int(run.step[rows[at[-1]]])
             doubled = float((np.diff(run.time)[np.maximum(rows[at] - 1, 0)] == 0).mean()) > 0.5
@@ -69,7 +68,7 @@ def one_for_two(run: Run) -> Iterator[Finding]:
     for k, (name, values) in enumerate(columns):
         for other, others in columns[:k]:
             both = np.flatnonzero(np.isfinite(values) & np.isfinite(others))
-            if len(both) >= _FEWEST and (values[both] == others[both]).all():
+            if len(both) >= FEWEST and (values[both] == others[both]).all():
                 yield Finding(
                     "used_twice", "error", name.partition("/")[0].partition(" ")[0],
                     (int(run.step[both[0]]), int(run.step[both[-1]])), {"times": len(both), "of": [other, name]},

@@ -9,13 +9,14 @@ import numpy as np
 
 from viz_estim.core.distributions import binom, chi2, norm, t
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, judge, level
+from viz_estim.diagnosis.finding import FEWEST, GROSS, SHEET, TINY, Finding, judge, level
+from viz_estim.diagnosis.stamps import MISSING
 from viz_estim.recording.reader import Run
-from viz_estim.scenarios.imu_health import DRIFT, GRAVITY, frozen_accel, frozen_gyro, still_prefix
+from viz_estim.scenarios.imu_health import DRIFT, GRAVITY, frozen_accel, frozen_gyro, quantum, still_prefix
 
 # Of the time within two counts of an extreme that a smooth signal spends within one: its way there is a parabola's. The
 # same of a regular sensor's intervals beyond 1.5 medians, had it Poisson's: (1/2)^1.5.
-_AT_THE_END, _LATE = 0.5**0.5, 0.5**1.5
+_AT_THE_END, _LATE = 0.5**0.5, 0.5**MISSING
 
 
 class Given(NamedTuple):
@@ -53,7 +54,7 @@ def imu(run: Run) -> Imu | None:
     if force is None or rate is None or force.shape[1:] != (3,) or rate.shape[1:] != (3,):
         return None
     rows = np.flatnonzero(np.isfinite(force).all(1) & np.isfinite(rate).all(1))
-    if len(rows) < 20:
+    if len(rows) < FEWEST:
         return None
     length = np.median(np.linalg.norm(force[rows], axis=1))
     return Imu(rows, rate[rows], force[rows] * (GRAVITY if abs(length - 1) < SHEET else 1.0))
@@ -74,8 +75,7 @@ def _driving(run: Run) -> Array | None:
 def frozen(run: Run) -> Iterator[Finding]:
     """A gyro that is flat while gravity turns (`imu_health.frozen_gyro`), and any sensor whose readings repeat.
 
-    Of a sensor as fine as a float, n equal readings in a row come by chance with N·qⁿ⁻¹, q the share of equal
-    neighbours elsewhere, at least 1/N.
+    Of a sensor as fine as a float, by how seldom so many come in a row (`held`).
     """
     both = imu(run)
     if both is not None:
@@ -90,12 +90,20 @@ def frozen(run: Run) -> Iterator[Finding]:
         if not continuous(values) or (both is not None and name in ("gyro", "accel")):
             continue
         same = (np.diff(values, axis=0) == 0).all(1)
-        for first, last in runs(same):
-            n = last - first + 2
-            elsewhere = max((same.sum() - (n - 1)) / len(same), 1 / len(same))
-            p = len(same) * elsewhere ** (n - 1)
-            if p < level("error", len(sensors)):
-                yield _stuck(run, name, rows[first], rows[last + 1], {"level": values[first]})
+        for first, last in held(same, len(sensors)):
+            yield _stuck(run, name, rows[first], rows[last + 1], {"level": values[first]})
+
+
+def held(same: np.ndarray, sensors: int) -> list[tuple[int, int]]:
+    """The runs of equal neighbours (first, last) in flags (M − 1,) that are too long for chance, of so many sensors: n
+    equal readings come with N·qⁿ⁻¹, q the share of equal neighbours elsewhere, at least 1/N."""
+    found = []
+    for first, last in runs(same):
+        n = last - first + 2
+        elsewhere = max((same.sum() - (n - 1)) / len(same), 1 / len(same))
+        if len(same) * elsewhere ** (n - 1) < level("error", sensors):
+            found.append((first, last))
+    return found
 
 
 def _stuck(run: Run, name: str, first: int, last: int, evidence: dict[str, Array]) -> Finding:
@@ -134,21 +142,21 @@ def silent(run: Run) -> Iterator[Finding]:
     """
     sensors = given(run)
     for name, (rows, _) in sensors.items():
-        if len(rows) < 10:
+        if len(rows) < FEWEST:
             continue
         gaps = np.diff(np.append(rows, len(run.step)))  # up to the run's end: there it is silent for good
         usual, N = float(np.median(gaps)), len(gaps)
-        regular = binom.cdf((gaps > 1.5 * usual).sum(), N, _LATE) < level("warning", len(sensors))
+        regular = binom.cdf((gaps > MISSING * usual).sum(), N, _LATE) < level("warning", len(sensors))
         longest = int(np.argmax(gaps))
         irregular = -np.expm1(N * np.log1p(-np.exp(-gaps / gaps.mean())))
         if regular:
-            lost = np.ceil(gaps / gaps[gaps <= 1.5 * usual].max()) - 1  # at least
+            lost = np.ceil(gaps / gaps[gaps <= MISSING * usual].max()) - 1  # at least
             q = np.maximum(lost.sum() - lost, 1) / (N + lost.sum() - lost)
             p = np.where((lost > 0) & (gaps > usual + 2), np.minimum(N * q**lost, 1.0), 1.0)
             found = np.flatnonzero(p < level("warning", len(sensors)))
         else:
             found = np.array([longest]) if judge(irregular[longest], len(sensors), large=False) else np.array([], int)
-        for k in found[:20]:
+        for k in found[:20]:  # as many as are told
             first, end = int(rows[k]) + 1, int(rows[k]) + int(gaps[k])
             last = min(end, len(run.step)) - 1
             for_good = end >= len(run.step)
@@ -177,10 +185,10 @@ def saturated(run: Run, without: Sequence[tuple[int, int]] = ()) -> Iterator[Fin
             for sign, end in ((1, "largest"), (-1, "smallest")):
                 x = sign * values[:, i]
                 distinct = np.unique(x)
-                if len(distinct) < 20:
+                if len(distinct) < FEWEST:
                     continue
                 top = x == distinct[-1]
-                near = (x >= distinct[-1] - _quantum(distinct) * 1.5) | top
+                near = (x >= distinct[-1] - quantum(distinct) * MISSING) | top
                 count, around = int(top.sum()), int(near.sum())
                 moving = (np.diff(x, prepend=np.nan) != 0) | (np.diff(x, append=np.nan) != 0)
                 p = float(binom.sf(count - 1, around, _AT_THE_END))
@@ -217,11 +225,11 @@ def biased_at_rest(run: Run) -> Iterator[Finding]:
     if both is None:
         return
     still = still_prefix(run.time[both.rows], both.rate, both.force) // 2
-    if still < 20:
+    if still < FEWEST:
         return
     rest = both.rate[:still]
     about = rest - rest.mean(0)
-    rho = (about[1:] * about[:-1]).sum(0) / np.maximum((about**2).sum(0), 1e-300)
+    rho = (about[1:] * about[:-1]).sum(0) / np.maximum((about**2).sum(0), TINY)
     fast = np.abs(rest.mean(0)).max() > DRIFT[0] and not _belied(both, rest.mean(0), run, still)
     if (np.abs(rho) > norm.isf(level("warning", 6)) / np.sqrt(still)).any() or fast:
         return  # readings that follow one another, or too large: it turns, however slowly
@@ -261,20 +269,13 @@ def runs(flags: np.ndarray) -> list[tuple[int, int]]:
     return [(int(first), int(end) - 1) for first, end in edges]
 
 
-def _quantum(distinct: Array) -> float:
-    """The smallest step between a component's sorted distinct values."""
-    steps = np.diff(distinct)
-    steps = steps[steps > 1e-9 * max(np.ptp(distinct), 1e-300)]
-    return float(steps.min()) if len(steps) else 0.0
-
-
 def continuous(values: Array) -> bool:
     """Whether readings (M, n) are so fine that none is met twice by chance: their steps are no multiples of one."""
     for x in values.T:
         distinct = np.unique(x)
-        quantum = _quantum(distinct)
-        if quantum and len(distinct) > 10:
-            steps = np.diff(distinct) / quantum
-            if np.abs(steps - np.round(steps)).mean() > 0.1:  # a quarter, where there is no grid
+        count = quantum(distinct)
+        if count and len(distinct) >= FEWEST:
+            steps = np.diff(distinct) / count
+            if np.abs(steps - np.round(steps)).mean() > 0.125:  # nearer to a quarter, as without a grid, than to none
                 return True
     return False

@@ -4,7 +4,7 @@ Willsky and Jones (1976), the generalised likelihood ratio test. A fault δ_k of
 s_k = δ_k − H·g_k, where g is how far the fault has moved the estimate: g⁺ = g + K·s, g' = F·g. The innovations are
 white if the filter is right, so that the fault's size is estimated by b/A, with A = Σ sᵀS⁻¹s and b = Σ sᵀS⁻¹ν, and
 b/√A is N(0, 1) where there is no fault. Where innovations are coloured the sum b scatters more: by how much its parts
-in 20 stretches of the run say (a cluster-robust variance; Liang and Zeger 1986), and the larger p of the two counts. A
+in 20 stretches of the run say (a cluster-robust variance; Liang and Zeger 1986), and both p count (`finding.Chance`). A
 fault that the state soaks up (a constant lag while driving straight) is found by what is left of it.
 """
 
@@ -19,35 +19,35 @@ from viz_estim.core.distributions import chi2, norm, t
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product, Space
 from viz_estim.diagnosis import tuning
-from viz_estim.diagnosis.evidence import Case, jacobians, once, parameter, tells_gain, transitions
-from viz_estim.diagnosis.finding import EXPLAINED, SOLVABLE, Finding, judge, level
-from viz_estim.diagnosis.fits import STRETCHES
+from viz_estim.diagnosis.evidence import Case, once, parameter, tells_gain
+from viz_estim.diagnosis.finding import EXPLAINED, MOST, TINY, Chance, Finding, judge, level
+from viz_estim.diagnosis.fits import in_stretches
+from viz_estim.diagnosis.linear import jacobians, straight, transitions
+from viz_estim.diagnosis.rounding import sound
 from viz_estim.recording.tables import StageTable
 
-_BACK = 3  # readings over which a rate of change is taken: backwards, so that it is known before the innovation
+# Readings over which a rate of change is taken: backwards, so that it is known before the innovation, which is white to
+# it however many they are.
+_BACK = 3
 
 
 class Fault(NamedTuple):
     """A fault's sensor (`range/1`), what it is, its estimated size, its score, and the score by stretches with its
-    degrees of freedom, 0 where it is not needed."""
+    degrees of freedom."""
 
     sensor: str
     kind: str
     size: float
     score: float
-    by_stretch: float = 0.0
-    dof: int = 0
+    by_stretch: float
+    dof: int
 
-    @property
-    def p(self) -> float:
-        """The chance of such a score where there is no fault."""
-        return self.p_beyond(0.0)
-
-    def p_beyond(self, size: float) -> float:
+    def p(self, size: float = 0.0) -> Chance:
         """The chance of such a score where the fault is of this size."""
-        share = max(0.0, 1 - size / max(abs(self.size), 1e-300))
-        p = 2 * norm.sf(share * abs(self.score))
-        return float(max(p, 2 * t.sf(share * self.by_stretch, self.dof)) if self.dof else p)
+        share = max(0.0, 1 - size / max(abs(self.size), TINY))
+        return Chance(
+            float(2 * norm.sf(share * abs(self.score))), float(2 * t.sf(share * abs(self.by_stretch), self.dof))
+        )
 
 
 def lags(case: Case) -> Iterator[Finding]:
@@ -56,19 +56,30 @@ def lags(case: Case) -> Iterator[Finding]:
     for fault in found:
         tau, name = fault.size, fault.sensor
         interval = float(np.median(np.diff(case.run.time)))
-        severity = judge(fault.p, len(found), large=fault.p_beyond(0.5 * interval))
+        severity = judge(fault.p(), len(found), large=fault.p(0.5 * interval))
         if severity is None or abs(tau) < interval or not _likelier(case, fault):
             continue  # less than a step is how the model takes its steps
-        if abs(tau) > 0.1 * (case.run.time[-1] - case.run.time[0]):
-            continue  # so long a lag is no matter of a rate
+        if not _straight(case, name, tau):
+            continue
         late = "late" if tau > 0 else "early"
         yield Finding(
             "lag", severity, name.partition("/")[0], case.whole,
-            {"lag_s": tau, "lag_samples": tau / max(interval, 1e-12), "z": fault.score, "p": fault.p},
+            {"lag_s": tau, "lag_samples": tau / max(interval, 1e-12), "z": fault.score, "p": max(fault.p())},
             f"readings of {name} come {abs(tau):.3g} s {late} against the rest ({abs(tau) / max(interval, 1e-12):.1f} "
             "samples): a delay of the sensor, another clock, or an index that is one off",
             f"pair {name} by its stamps and not by index; correct its stamps by {-tau:+.3g} s",
         )  # fmt: skip
+
+
+def _straight(case: Case, name: str, lag: float) -> bool:
+    """Whether what a sensor is expected to read goes along a line for so long (`evidence.straight`)."""
+    for table in case.run.stages.values():
+        space = table.spaces.get("innovation")
+        if isinstance(space, Product) and name in space.parts:
+            rows = table.values["innovation.offered"][:, list(space.parts).index(name)] > 0
+            time = case.run.time[np.searchsorted(case.run.step, table.step[rows])]
+            return straight(space.parts[name], table.values["innovation.predicted"][rows, space.at[name]], time, lag)
+    return False
 
 
 def biases(case: Case) -> Iterator[Finding]:
@@ -81,7 +92,7 @@ def biases(case: Case) -> Iterator[Finding]:
     for fault in sorted(found, key=lambda one: -abs(one.score)):
         name = fault.sensor.partition("/")[0]
         axis, unit = fault.kind.removeprefix("bias ").partition(" ")[::2]
-        severity = judge(fault.p, len(found), large=fault.p_beyond(_foreseen(case, name, axis)))
+        severity = judge(fault.p(), len(found), large=fault.p(_foreseen(case, name, axis)))
         if severity is None or name in told or not _likelier(case, fault):
             continue
         told.add(name)
@@ -93,7 +104,7 @@ def biases(case: Case) -> Iterator[Finding]:
         )
         yield Finding(
             "biased_innovation", severity, name, case.whole,
-            {"component": axis, "bias": fault.size, "z": fault.score, "p": fault.p},
+            {"component": axis, "bias": fault.size, "z": fault.score, "p": max(fault.p())},
             f"a constant bias of {fault.size:+.3g} {unit} in {fault.sensor} ({axis}) explains the innovations, which "
             "the state soaks up in part",
             remedy,
@@ -118,7 +129,7 @@ def _likelier(case: Case, fault: Fault) -> bool:
     count = sum(r.dof * len(r) for r in case.sensors.values())
     if fault.score**2 < EXPLAINED * (total - chi2.isf(level("warning", 1), count)):
         return False
-    left = max(total - fault.score**2 * max(1.0, _misfit(case)), 1e-300)
+    left = max(total - fault.score**2 * max(1.0, _misfit(case)), TINY)
     gain = 0.5 * (total - count - count * np.log(left / count))
     return bool(gain >= max((one.gain for one in tuning.factors(case).values()), default=0.0))
 
@@ -149,7 +160,7 @@ def faults(case: Case) -> list[Fault]:
             kinds.append((name, "lag", part))
     kinds = list({(name, kind): (name, kind, part) for name, kind, part in kinds}.values())
     column = {(name, kind): j for j, (name, kind, _) in enumerate(kinds)}
-    if not kinds or len(kinds) > 40:
+    if not kinds or len(kinds) > MOST:
         return []
     q, d = len(kinds), len(case.space.axes)
     for update in updates.values():
@@ -169,33 +180,20 @@ def faults(case: Case) -> list[Fault]:
                 g = g + update.gain[row] @ s
         else:
             g = np.zeros((d, q))
-    A, b = np.zeros((STRETCHES, q)), np.zeros((STRETCHES, q))
-    for update in updates.values():
-        rows = update.sound & update.counts
-        s, w = update.left[rows], update.inverse[rows] @ update.left[rows]
-        stretch = update.table.place[rows] * STRETCHES // len(case.sequence.stage)
-        np.add.at(A, stretch, (s * w).sum(1))
-        np.add.at(b, stretch, (update.residual[rows][:, None] @ w)[:, 0])
-    if not np.isfinite(A).all():
+    place, A, b = (np.concatenate(of) for of in zip(*(update.told() for update in updates.values()), strict=True))
+    if not np.isfinite(A).all() or not len(A):
         return []
-    misfit = max(1.0, _misfit(case))
+    order, misfit, told = np.argsort(place), max(1.0, _misfit(case)), A.sum(0) > 0
+    A, b = A[order][:, told], b[order][:, told]
+    size = b.sum(0) / A.sum(0)
+    pieces = in_stretches(b - size * A)
+    spread = max(len(pieces) - 1, 1)
+    error = np.sqrt([A.sum(0) * misfit, np.square(pieces).sum(0) * len(pieces) / spread])
+    score = b.sum(0) / np.maximum(error, TINY)
     return [
-        _estimated(name, kind, A[:, j], b[:, j], misfit)
-        for j, (name, kind, _) in enumerate(kinds)
-        if A[:, j].sum() > 1e-12
+        Fault(name, kind, float(size[j]), float(score[0, j]), float(score[1, j]), spread)
+        for j, (name, kind, _) in enumerate(kind for kind, of in zip(kinds, told, strict=True) if of)
     ]
-
-
-def _estimated(name: str, kind: str, A: Array, b: Array, misfit: float) -> Fault:
-    """The fault from its sums by stretch (B,)."""
-    size = b.sum() / A.sum()
-    score = float(b.sum() / np.sqrt(A.sum() * misfit))
-    used = int((A > 0).sum())
-    rest = (b - size * A)[A > 0]
-    variance = float(np.square(rest).sum() * used / max(used - 1, 1))
-    if variance > A.sum() * misfit * chi2.isf(0.01, max(used - 1, 1)) / max(used - 1, 1):
-        return Fault(name, kind, float(size), score, float(abs(b.sum()) / np.sqrt(variance)), max(used - 1, 1))
-    return Fault(name, kind, float(size), score)
 
 
 def _misfit(case: Case) -> float:
@@ -213,21 +211,23 @@ class _Update:
         assert isinstance(space, Product)
         self.space, self.table, self.case = space, table, case
         get = table.values
-        _, P = case.sequence.before(table)
         S = get["innovation.cov"]
         self.residual, self.gain = get["innovation.residual"], get["gain"]
-        self.sound = np.asarray(np.isfinite(P).all((1, 2)) & np.isfinite(S).all((1, 2)))
-        self.sound[self.sound] &= np.linalg.cond(S[self.sound]) < SOLVABLE
-        d, m = get["innovation.cross_cov"].shape[1:]
-        self.H, self.inverse = np.zeros((len(P), m, d)), np.zeros((len(P), m, m))
-        ok = self.sound
-        cross = get["innovation.cross_cov"][ok]
-        self.H[ok] = jacobians(P[ok], cross)
-        self.inverse[ok] = np.linalg.solve(S[ok], np.broadcast_to(np.eye(m), S[ok].shape))
+        self.H = jacobians(case, table)
+        self.sound: np.ndarray = np.isfinite(self.H).all((1, 2)) & sound(S)
+        self.inverse = np.zeros_like(S)
+        self.inverse[self.sound] = np.linalg.inv(S[self.sound])
         self.offered: np.ndarray = get["innovation.offered"] > 0
         whole = self.offered.all(1)
         known = [readings.step for readings in case.sensors.values()]
         self.counts: np.ndarray = whole & np.isin(table.step, np.concatenate(known) if known else [])
+
+    def told(self) -> tuple[np.ndarray, Array, Array]:
+        """Of the rows that count the place (K,), and what they add to A and to b (K, q)."""
+        rows = self.sound & self.counts
+        s = self.left[rows]
+        w = self.inverse[rows] @ s
+        return self.table.place[rows], (s * w).sum(1), (self.residual[rows][:, None] @ w)[:, 0]
 
     def prepare(self, column: dict[tuple[str, str], int], q: int) -> None:
         predicted = self.table.values["innovation.predicted"]

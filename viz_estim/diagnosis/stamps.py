@@ -8,25 +8,24 @@ import numpy as np
 
 from viz_estim.core.distributions import norm
 from viz_estim.core.quaternions import Array
-from viz_estim.diagnosis.finding import SHEET, Finding, level
+from viz_estim.diagnosis.finding import FEWEST, SHEET, Finding, level
+from viz_estim.diagnosis.rounding import NANOSECOND, of_stamps
 from viz_estim.recording.reader import Run
 
-_ROUNDING = 1e-9  # s: to what stamps are kept
-_MISSING = 1.5  # usual intervals: what is longer is nearer to two than to one, so that a sample is missing
+MISSING = 1.5  # usual intervals: what is longer is nearer to two than to one, so that a sample is missing
 
 
 def stamps(run: Run) -> Iterator[Finding]:
     """What cannot be: stamps that go back or repeat, a dt that is not their difference by more than rounding.
 
-    dt and stamps are each rounded to the nanosecond, and a float of the stamp has its own last digit. A dt that is off
-    by a share moves the state too far by that share: an error from SHEET of the whole time on, as of any scale. What
-    can be, by its chance: gaps and jitter.
+    A dt that is off by a share moves the state too far by that share: an error from SHEET of the whole time on, as of
+    any scale. What can be, by its chance: gaps and jitter.
     """
     interval = np.diff(run.time)
     if len(interval) < 3:
         return
     usual = float(np.median(interval))
-    rounding = 4 * (_ROUNDING + float(np.spacing(np.abs(run.time).max())))
+    rounding = of_stamps(run)
     back = np.flatnonzero(interval < 0) + 1
     same = np.flatnonzero(interval == 0) + 1
     other = np.flatnonzero((np.abs(run.dt[1:] - interval) > rounding) & (run.dt[1:] > 0)) + 1
@@ -52,7 +51,7 @@ def stamps(run: Run) -> Iterator[Finding]:
         longest = float(interval[gaps - 1].max())
         yield _finding(
             run, gaps, "warning", "gaps",
-            f"the stamps leave gaps of up to {longest:.3g} s, {longest / max(usual, _ROUNDING):.0f} usual intervals",
+            f"the stamps leave gaps of up to {longest:.3g} s, {longest / max(usual, NANOSECOND):.0f} usual intervals",
             "look for lost samples in the log; over a gap the prediction must use the whole dt",
         )  # fmt: skip
     yield from _jitter(run, interval, usual, rounding)
@@ -69,7 +68,7 @@ def _gaps(interval: Array, usual: float, rounding: float) -> np.ndarray:
     beyond = np.sort(interval)[-max(len(interval) // 4, 1) :] - u
     beta = max(float(np.median(beyond)) / np.log(2), rounding)
     p = len(interval) * 0.25 * np.exp(-(interval - u) / beta)
-    return np.flatnonzero((p < level("warning", 2)) & (interval > _MISSING * usual)) + 1
+    return np.flatnonzero((p < level("warning", 2)) & (interval > MISSING * usual)) + 1
 
 
 def _jitter(run: Run, interval: Array, usual: float, rounding: float) -> Iterator[Finding]:
@@ -79,9 +78,9 @@ def _jitter(run: Run, interval: Array, usual: float, rounding: float) -> Iterato
     have 0, with the standard error 1/√N (Box and Jenkins 1970): the likelier of the two is the nearer. A note where the
     spread is SHEET of an interval, as which it would scale a motion: the true times are known better than the stamps.
     """
-    held = interval[(interval > 0) & (interval < _MISSING * usual)]
+    held = interval[(interval > 0) & (interval < MISSING * usual)]
     N, spread = len(held), float(held.std()) if len(held) else 0.0
-    if N < 50 or spread < max(SHEET * usual, 10 * rounding):
+    if N < FEWEST or spread < max(SHEET * usual, rounding):
         return
     about = held - held.mean()
     rho = float((about[1:] * about[:-1]).sum() / (about**2).sum())

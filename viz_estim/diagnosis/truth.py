@@ -15,7 +15,7 @@ from viz_estim.diagnosis import causes, frames
 from viz_estim.diagnosis.against import against
 from viz_estim.diagnosis.causes import Cause
 from viz_estim.diagnosis.evidence import Case, parameter
-from viz_estim.diagnosis.finding import EXPLAINED, SHEET, Finding, Severity, judge
+from viz_estim.diagnosis.finding import EXPLAINED, GROSS, SHEET, Finding, Severity, judge
 from viz_estim.diagnosis.fits import Against
 
 
@@ -29,7 +29,8 @@ def sensors(case: Case) -> Iterator[Finding]:
     squared error with which the filter foresees the reading, and a lag beyond half of a step.
 
     Which causes are named is a matter of size and not of chance, of which with enough readings none is left: a cause
-    must be larger than the model's own error, must explain EXPLAINED of what is off beyond the noise, and must make the
+    must be larger than the model's own error, by GROSS (that of any mean or slope is its root mean square at
+    most, by Cauchy and Schwarz), must explain EXPLAINED of what is off beyond the noise, and must make the
     squared error with which the filter foresees the reading larger by SHEET at least (`_small`).
     """
     those = against(case)
@@ -38,7 +39,8 @@ def sensors(case: Case) -> Iterator[Finding]:
     total: dict[tuple[str, str], float] = {}
     found: dict[tuple[str, str], list[tuple[float, Against, Cause, Severity]]] = {}
     for one in those:
-        name, slip, small = one.name.partition("/")[0], 2 * float(np.median(one.slip)), _small(one)
+        name, small = one.name.partition("/")[0], _small(one)
+        slip = GROSS * float(np.sqrt(np.mean(np.square(one.slip))))
         for kind, cause in _causes(one, those, interval):
             severity, score = judge(cause.p, tests, large=cause.large), cause.score(len(one.step))
             total[name, kind] = total.get((name, kind), 0.0) + max(score, 0.0)
@@ -48,7 +50,7 @@ def sensors(case: Case) -> Iterator[Finding]:
         likeliest = max((key for key in found if key[0] == name), key=lambda key: total[key])
         _, one, cause, severity = max(found[likeliest], key=lambda entry: entry[0])
         steps = int(one.step[0]), int(one.step[-1])
-        evidence = cause.evidence | {"p": cause.p, "explained": cause.explained, "against": "truth"}
+        evidence = cause.evidence | {"p": float(np.max(cause.p)), "explained": cause.explained, "against": "truth"}
         evidence |= {"by_control": True} if one.by_control else {}
         known = parameter(case.run, f"{name}_bias")
         estimated = f"set {known[0]}=estimate; or " if known and known[1] != "estimate" and not cause.known else ""

@@ -17,10 +17,13 @@ import scipy
 from viz_estim.core.distributions import chi2
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
-from viz_estim.diagnosis.evidence import Case, jacobians, once, tells_gain, transitions
+from viz_estim.diagnosis.evidence import Case, once, tells_gain
+from viz_estim.diagnosis.finding import LARGEST
+from viz_estim.diagnosis.linear import jacobians, transitions
 from viz_estim.diagnosis.outlying import outlying
 from viz_estim.recording.tables import StageTable
 
+# How finely and how far is looked; a factor at the end of it is not told as one.
 _GRID = np.arange(-6.0, 6.5) * np.log(10) / 2  # log factors, 10⁻³ to 10³
 _PLACES = 4000  # stages at most, from the first that counts on: of a thousand readings a factor is known to 5 %
 
@@ -53,7 +56,7 @@ class Tuned(NamedTuple):
         fine, values = _spline(self.scores, self.grid)
         if not fine[0] <= np.log(factor) <= fine[-1]:
             return np.inf
-        return float(np.exp(min(values.max() - values[np.searchsorted(fine, np.log(factor))], 700.0)))
+        return float(np.exp(min(values.max() - values[np.searchsorted(fine, np.log(factor))], LARGEST)))
 
 
 class _Turned(NamedTuple):
@@ -62,8 +65,8 @@ class _Turned(NamedTuple):
     H: Array  # (M, m, d)
     residual: Array  # (M, m)
     noise: Array  # (M, m), variances
-    on: list[list[int]]  # M, those of a row that were used and are no outliers
-    moved: Array  # (M, d), by how much the filter moved its estimate
+    on: list[list[int]]  # by row those of the m whose reading was used and is no outlier, and whose model is known
+    moved: Array  # (M, d, 1), K·ν
     sensors: list[str]  # m
 
 
@@ -202,29 +205,21 @@ def _scores(case: Case, model: _Model, scale: dict[str, Array], B: int) -> Array
         name = table.name
         if name in model.moves and P is not None:
             F = model.moves[name][row]
-            x, P = F @ x, _mapped(P, F)
-            P += model.noise[name][row][:, :, None] * scale["Q"]
+            x, P = F @ x, _mapped(P, F) + model.noise[name][row][:, :, None] * scale["Q"]
         elif name in model.updates and P is not None:
             readings = model.turned[name]
             if on := readings.on[row]:
                 v, S = np.empty((2, len(on), B))
-                H, residual, noise = readings.H[row], readings.residual[row].tolist(), noises[name][row]
-                x, P = x.copy(), P.copy()
-                by_rows = P.reshape(d, d * B)
                 for k, i in enumerate(on):
-                    C = (H[i] @ by_rows).reshape(d, B)
-                    S[k] = H[i] @ C
-                    S[k] += noise[i]
-                    v[k] = residual[i] - H[i] @ x
+                    h = readings.H[row, i]
+                    C = (h @ P.reshape(d, d * B)).reshape(d, B)
+                    S[k] = h @ C + noises[name][row, i]
+                    v[k] = readings.residual[row, i] - h @ x
                     gain = C / S[k]
+                    x += gain * v[k]
                     P -= gain[:, None] * C
-                    gain *= v[k]
-                    x += gain
-                v *= v
-                v /= S
-                v += np.log(S)
-                score -= 0.5 * v.sum(0)
-            x = x - readings.moved[row][:, None]
+                score -= 0.5 * (v * v / S + np.log(S)).sum(0)
+            x -= readings.moved[row]
             if not space.flat:
                 T = model.carried[name][row]
                 x, P = T @ x, _mapped(P, T)
@@ -235,7 +230,7 @@ def _scores(case: Case, model: _Model, scale: dict[str, Array], B: int) -> Array
 
 def _turned(case: Case, table: StageTable, before: Array) -> _Turned:
     get = table.values
-    H, residual = jacobians(before, get["innovation.cross_cov"]).copy(), get["innovation.residual"].copy()
+    H, residual = jacobians(case, table).copy(), get["innovation.residual"].copy()
     noise, on, sensors = np.empty_like(residual), np.zeros(residual.shape, bool), []
     steps = {name: r.step[~outlying(r.nis, r.dof, len(case.sensors)).far] for name, r in case.sensors.items()}
     for i, (part, axes) in enumerate(_parts(table).items()):
@@ -250,8 +245,8 @@ def _turned(case: Case, table: StageTable, before: Array) -> _Turned:
         known = np.isin(table.step, steps.get(sensor, ()))
         on[:, axes] = (get["innovation.offered"][:, i] * get["innovation.used"][:, i] * known > 0)[:, None]
     nu = get["innovation.residual"]
-    moved = (np.nan_to_num(get["gain"]) @ np.nan_to_num(nu)[:, :, None])[:, :, 0]
-    on[~np.asarray(np.isfinite(H).all((1, 2)) & np.isfinite(nu).all(1))] = False
+    on &= np.asarray(np.isfinite(H).all((1, 2)) & np.isfinite(nu).all(1))[:, None]
+    moved = np.nan_to_num(get["gain"]) @ np.nan_to_num(nu)[..., None]
     return _Turned(H, residual, noise, [np.flatnonzero(row).tolist() for row in on], moved, sensors)
 
 

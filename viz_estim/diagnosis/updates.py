@@ -18,13 +18,12 @@ import numpy as np
 from viz_estim.core.measurement import symmetrised
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
-from viz_estim.diagnosis.covariance import rounding_of, sound
 from viz_estim.diagnosis.doubled import LINE, doubled
-from viz_estim.diagnosis.evidence import Case, sensor_of, tangents, tells_gain, tells_reading
-from viz_estim.diagnosis.finding import GROSS, SHEET, Finding, Severity
+from viz_estim.diagnosis.evidence import Case, sensor_of, tells_gain, tells_reading
+from viz_estim.diagnosis.finding import GROSS, REPEATED, SHEET, TINY, Finding, Severity
+from viz_estim.diagnosis.linear import tangents
+from viz_estim.diagnosis.rounding import rounding_of, sound
 from viz_estim.recording.tables import StageTable
-
-_FEWEST = 3
 
 
 class Told(NamedTuple):
@@ -87,9 +86,9 @@ def _told(case: Case, table: StageTable) -> Told | None:
     rows = (get["innovation.used"] > 0).all(1) & (table.step >= case.first)
     for name in ("cov", "innovation.cov", "innovation.noise", "innovation.cross_cov", "gain"):
         rows &= np.isfinite(get[name]).all((1, 2))
-    rows &= np.isfinite(P).all((1, 2)) & np.isfinite(get["innovation.residual"]).all(1)
-    rows[rows] &= sound(symmetrised(P[rows])) & sound(symmetrised(get["innovation.cov"][rows]))
-    if rows.sum() < _FEWEST:
+    rows &= case.sequence.sound_before(table) & np.isfinite(get["innovation.residual"]).all(1)
+    rows[rows] &= sound(symmetrised(get["innovation.cov"][rows]))
+    if rows.sum() < REPEATED:
         return None
     moved = case.space.minus(table.mean[rows], mean[rows])
     difference = space.minus(get["innovation.z"][rows], get["innovation.predicted"][rows])
@@ -144,7 +143,7 @@ def _spread(told: Told, points: bool) -> _Line | None:
 def _gain(told: Told) -> _Line | None:
     """K·S = C. Large is a gain that leaves GROSS times the least variance in some direction."""
     size = np.linalg.norm(told.C, axis=(1, 2))
-    if np.median(np.linalg.norm(told.K @ told.S + told.C, axis=(1, 2)) / np.maximum(size, 1e-300)) < told.near:
+    if np.median(np.linalg.norm(told.K @ told.S + told.C, axis=(1, 2)) / np.maximum(size, TINY)) < told.near:
         return (
             "error", "gain", "the gain has the wrong sign, −P·Hᵀ·S⁻¹: every update moves the mean away from its "
             "reading", "write K = P·Hᵀ·S⁻¹, and add K·ν to the mean",
@@ -193,7 +192,7 @@ def _cov(told: Told) -> _Line | None:
     if not sound(left).all():
         return None
     low, high = _ratios(told.after, left)
-    severity = _severity(np.maximum(high, 1 / np.maximum(low, 1e-300)), told)
+    severity = _severity(np.maximum(high, 1 / np.maximum(low, TINY)), told)
     if severity is None:
         return None
     if _alike(told.after, told.P, told):
@@ -207,7 +206,7 @@ def _cov(told: Told) -> _Line | None:
             "error", "covariance", "the covariance grows with every reading: P⁺ is (I + K·H)·P, with a wrong sign",
             "write P⁺ = (I − K·H)·P, better in Joseph's form",
         )  # fmt: skip
-    how = f"up to {float(np.median(high)):.2g}×" if np.median(high) > 1 / max(float(np.median(low)), 1e-300) else (
+    how = f"up to {float(np.median(high)):.2g}×" if np.median(high) > 1 / max(float(np.median(low)), TINY) else (
         f"down to {float(np.median(low)):.2g} of"
     )  # fmt: skip
     return (
@@ -235,7 +234,7 @@ def _added(told: Told, Q: Array | None, parts: list[slice]) -> _Line | None:
         return None
     rows = np.isfinite(Q).all((1, 2))
     beyond, rounding = told.after - left, rounding_of(told.P, told.after)
-    if rows.sum() < _FEWEST or np.median(np.abs(beyond[rows]).max((1, 2)) / rounding[rows]) < 1:
+    if rows.sum() < REPEATED or np.median(np.abs(beyond[rows]).max((1, 2)) / rounding[rows]) < 1:
         return None
     _, high = _ratios(told.after, left)
     severity = _severity(high, told) or "warning"
@@ -263,7 +262,7 @@ def _left(told: Told) -> Array:
 def _ratios(A: Array, B: Array) -> tuple[Array, Array]:
     """The smallest and the largest eigenvalue (M,) of B⁻¹·A, symmetric matrices."""
     values, vectors = np.linalg.eigh(symmetrised(B))
-    root = vectors / np.sqrt(np.maximum(values, 1e-300))[:, None, :]
+    root = vectors / np.sqrt(np.maximum(values, TINY))[:, None, :]
     found = np.asarray(np.linalg.eigvalsh(np.swapaxes(root, 1, 2) @ symmetrised(A) @ root), float)
     return found[:, 0], found[:, -1]
 
@@ -281,7 +280,7 @@ def _multiple(A: Array, B: Array, parts: list[slice], rounding: Array, told: Tol
     eigenvalues of its block; None where it is not. Of one eigenvalue any c would do: then it must be 1."""
     a, b = (np.concatenate([np.linalg.eigvalsh(symmetrised(M[:, k, k])) for k in parts], axis=1) for M in (A, B))
     there = np.median(np.maximum(a, b) / rounding[:, None], axis=0) > 1
-    ratio = np.median(a[:, there] / np.maximum(b[:, there], 1e-300), axis=0)
+    ratio = np.median(a[:, there] / np.maximum(b[:, there], TINY), axis=0)
     c = float(np.median(ratio)) if len(ratio) else 0.0
     if c <= 0 or np.abs(ratio / c - 1).max() > told.near:
         return None
@@ -289,5 +288,5 @@ def _multiple(A: Array, B: Array, parts: list[slice], rounding: Array, told: Tol
 
 
 def _alike(A: Array, B: Array, told: Told) -> bool:
-    off = np.abs(A - B).max((1, 2)) / np.maximum(np.abs(B).max((1, 2)), 1e-300)
+    off = np.abs(A - B).max((1, 2)) / np.maximum(np.abs(B).max((1, 2)), TINY)
     return bool(np.median(off) < told.near)

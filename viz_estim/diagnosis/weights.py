@@ -13,10 +13,8 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.diagnosis.evidence import Case
-from viz_estim.diagnosis.finding import Finding, at_steps, level
-
-_FEWEST = 3  # steps at which it is seen
-_ROUNDED = 1e-5  # of logarithms that were normalised, in float32
+from viz_estim.diagnosis.finding import REPEATED, Finding, at_steps, level
+from viz_estim.diagnosis.rounding import of_logs
 
 
 def forgotten(case: Case) -> Iterator[Finding]:
@@ -28,13 +26,15 @@ def forgotten(case: Case) -> Iterator[Finding]:
         holds = False
         for row, after in enumerate(table.values["log_weights"]):
             before, told = case.sequence.past(table, row, "log_weights"), table.values["log_likelihoods"][row]
-            if before is None or before.shape != after.shape or not _spread(before) > _ROUNDED:
+            if before is None or before.shape != after.shape:
                 continue
-            size = max(float(np.ptp(told)), 1.0) * _ROUNDED
+            size = of_logs(before, after, told)
+            if not _spread(before) > 2 * size:  # else it is the same with them and without
+                continue
             holds |= _spread(after - told - before) < size
             if _spread(after - told) < size:
                 steps.append(int(table.step[row]))
-        if len(steps) >= _FEWEST and not holds:
+        if len(steps) >= REPEATED and not holds:
             yield Finding(
                 "weights", "error", None, (steps[0], steps[-1]), {"kind": "forgotten", "times": len(steps)},
                 f"{at_steps(len(steps))} the weights are the last readings' likelihoods alone: those from before are "
@@ -61,7 +61,7 @@ def drawn(case: Case) -> Iterator[Finding]:
             if copied.any():
                 steps.append(int(table.step[row]))
                 rarest = min(rarest, float(1 - copied.mean()))
-        if len(steps) >= _FEWEST:
+        if len(steps) >= REPEATED:
             yield Finding(
                 "weights", "error", None, (steps[0], steps[-1]), {"kind": "drawn", "times": len(steps)},
                 f"{at_steps(len(steps))} the resampling copies particles that hardly weigh anything (up to "

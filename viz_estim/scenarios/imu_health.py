@@ -17,8 +17,10 @@ from viz_estim.core.quaternions import Array
 _WARMING = (0.022, 0.034)  # rad/s, m/s²
 _LEVEL = (0.35, 1.05)  # rad/s, m/s²: how far from 0 and from gravity a still sensor may read
 DRIFT = (0.0056, 0.0084)  # rad/s, m/s²: by how much its offset moves within a run
-# Of gravity: by how much a sensor is pushed without being turned. By a hand, 3σ of what the real sets show (as in
-# `imu_simulation`); and of a box on a table, up to its friction, dry wood on wood or metal.
+# Of gravity: by how much a sensor is pushed without being turned; data, and the size from which a turn counts. By
+# a hand: the length of what real sets read, smoothed over 0.1 s, scatters by 0.03 to 0.06 about gravity's; that a gyro
+# is flat in a hand besides is what chance does not do. Of a box on a table, up to its friction, 0.2 to 0.5 of dry wood
+# on wood or metal.
 _PUSHES = (0.1, 0.5)
 
 # How far is looked, which decides no rate.
@@ -26,7 +28,9 @@ _BASELINE = 0.5  # s: the prefix that later readings are held against
 _SMOOTHING = 0.1  # s
 _SHORTEST_FREEZE = 0.3  # s: of fewer windows of 0.1 s than three no turn is told
 
-_RATE = 1e-4  # of a run in which noise alone passes for motion or for a freeze, over all its samples and channels
+_SPAN = 2.5  # counts: of what stays within one of a value it is two at most, to rounding
+_RATE = 1e-4  # of a run in which noise alone passes for motion, over all its samples and channels
+_FREEZE = _RATE / 36  # and for a freeze, of a gyro or of an accelerometer: a check's share of a run's errors
 _CHANNELS = 6
 _FEWEST = 20  # readings of which von Neumann's ratio can tell the smoothest motion at that rate
 
@@ -87,7 +91,7 @@ def _bound(base: Array, count: int, drift: float, tests: int) -> Array:
     beyond what the offset drifts; and half a count of either mean, for whole counts don't average out."""
     n = len(base)
     error = base.std(0, ddof=1) * np.sqrt(1 / count + 1 / n)
-    counts = np.array([_quantum(channel) for channel in base.T])
+    counts = np.array([quantum(channel) for channel in base.T])
     return np.asarray(drift + counts + t.isf(_RATE / tests, n - 1) * error)
 
 
@@ -120,10 +124,10 @@ def frozen_gyro(stamps: Array, gyro: Array, accel: Array, bias: Array) -> np.nda
     """
     frozen = np.zeros(len(stamps), bool)
     frozen[: stuck_at_first(stamps, gyro - bias, accel)] = True
-    quantum = np.array([_quantum(channel) for channel in gyro.T])
+    counts = np.array([quantum(channel) for channel in gyro.T])
     for first, end in flat_runs(stamps, gyro):
         rate = gyro[first:end].mean(0) - bias
-        at_rest = bool((np.abs(rate) <= DRIFT[0] + quantum).all())
+        at_rest = bool((np.abs(rate) <= DRIFT[0] + counts).all())
         turn, noise = _missed_turn(stamps[first:end], rate, accel[first:end], len(stamps))
         pushed = np.arctan(_PUSHES[int(at_rest)])  # the noise has its jerks in it: the larger of the two counts
         if turn > DRIFT[0] * (stamps[end - 1] - stamps[first]) + max(noise, pushed):
@@ -137,15 +141,15 @@ def flat_runs(stamps: Array, values: Array) -> list[tuple[int, int]]:
     width = round(_SHORTEST_FREEZE / max(float(np.median(np.diff(stamps))), 1e-6)) | 1  # odd: the windows are centred
     if width < 3 or width >= len(stamps):
         return []
-    quantum = np.array([_quantum(channel) for channel in values.T])
+    counts = np.array([quantum(channel) for channel in values.T])
     span = scipy.ndimage.maximum_filter1d(values, width, axis=0) - scipy.ndimage.minimum_filter1d(values, width, axis=0)
-    centres = (span <= 2.01 * quantum).all(1)
+    centres = (span <= _SPAN * counts).all(1)
     # The windows at the two ends would lean on samples mirrored in; the flat runs are the union of the flat windows.
     centres[: width // 2] = centres[-(width // 2) :] = False
     flat = scipy.ndimage.maximum_filter1d(centres, width)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]])))
     # Two flat runs may touch, where a stuck sensor comes to itself at rest: the jump between them parts them.
-    jumps = np.flatnonzero((np.abs(np.diff(values, axis=0)) > 2.01 * quantum).any(1)) + 1
+    jumps = np.flatnonzero((np.abs(np.diff(values, axis=0)) > _SPAN * counts).any(1)) + 1
     return [b for e in edges.reshape(-1, 2) for b in _parted(e[0], e[1], jumps)]
 
 
@@ -156,7 +160,7 @@ def frozen_accel(stamps: Array, gyro: Array, accel: Array) -> np.ndarray:
     carry gravity by more than their noise and drift add up to, and than two counts hide.
     """
     frozen = np.zeros(len(stamps), bool)
-    quantum = np.array([_quantum(channel) for channel in accel.T])
+    counts = np.array([quantum(channel) for channel in accel.T])
     for first, end in flat_runs(stamps, accel):
         down = accel[first:end].mean(0)
         length = max(float(np.linalg.norm(down)), 1e-9)
@@ -166,8 +170,8 @@ def frozen_accel(stamps: Array, gyro: Array, accel: Array) -> np.ndarray:
         carried = np.linalg.norm(np.cumsum(steps, axis=0), axis=1).max(initial=0.0)
         noise = np.diff(gyro[first:end], axis=0).std(0).max() / np.sqrt(2)
         walk = noise * (stamps[end - 1] - stamps[first]) / np.sqrt(end - first)  # what noise alone adds up to, 1σ
-        hidden = 2.01 * float(np.linalg.norm(quantum)) / length + DRIFT[0] * (stamps[end - 1] - stamps[first])
-        if carried > hidden + norm.isf(_RATE / (4 * len(stamps))) * walk:  # the most of a walk: twice its end
+        hidden = 2 * float(np.linalg.norm(counts)) / length + DRIFT[0] * (stamps[end - 1] - stamps[first])
+        if carried > hidden + norm.isf(_FREEZE / (4 * len(stamps))) * walk:  # the most of a walk: twice its end
             frozen[first:end] = True
     return frozen
 
@@ -178,10 +182,11 @@ def _parted(first: int, end: int, jumps: np.ndarray) -> list[tuple[int, int]]:
     return list(pairwise(cuts))
 
 
-def _quantum(channel: Array) -> float:
-    """The smallest step between a channel's readings: one count, or next to nothing for a fine log."""
+def quantum(channel: Array) -> float:
+    """The smallest step between a channel's readings (T,) that is no rounding of theirs: one count, or next to nothing
+    for a fine log."""
     steps = np.diff(np.unique(channel))
-    steps = steps[steps > 1e-6 * max(np.ptp(channel), 1e-12)]
+    steps = steps[steps > 8 * np.finfo(float).eps * np.abs(channel).max(initial=0.0)]
     return float(steps.min()) if len(steps) else 0.0
 
 
@@ -191,7 +196,7 @@ def _missed_turn(stamps: Array, rate: Array, accel: Array, tests: int) -> tuple[
 
     The accelerometer is smoothed over 0.1 s, by whole windows only: those at the ends would lean to one side. Its noise
     is that of successive differences (von Neumann 1941); of two directions' errors across gravity the sum of squares is
-    χ²(2), so that a share 1/tests of `_RATE` bounds those of all windows.
+    χ²(2), so that a share 1/tests of `_FREEZE` bounds those of all windows.
     """
     width = max(3, round(_SMOOTHING / float(np.median(np.diff(stamps)))) | 1)
     half = width // 2
@@ -203,7 +208,7 @@ def _missed_turn(stamps: Array, rate: Array, accel: Array, tests: int) -> tuple[
     seen = seen / length
     since = stamps[half:-half] - stamps[half]
     carried = quaternions.rotate(quaternions.exp(-since[:, None] * rate), seen[:1])
-    noise = white * float(np.sqrt(2 * chi2.isf(_RATE / tests, 2)))  # of the first window and of a later one
+    noise = white * float(np.sqrt(2 * chi2.isf(_FREEZE / tests, 2)))  # of the first window and of a later one
     return min(_widest(seen, carried), _widest(seen, seen[:1])), noise
 
 
