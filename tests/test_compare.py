@@ -25,7 +25,6 @@ from viz_estim.core.stages import Stage
 from viz_estim.differences import first_difference, other_data
 from viz_estim.recording import links, overlaid_stages
 from viz_estim.recording.compared import Clock, Compared
-from viz_estim.recording.comparison_view import shared_part
 from viz_estim.recording.merged import _recoloured
 from viz_estim.recording.reader import Run, load
 from viz_estim.recording.recorder import Recorder
@@ -270,13 +269,6 @@ def test_runs_of_other_lengths_rates_and_starts_are_compared_where_they_overlap(
             assert other_data(a, b) is None
             assert first_difference(a, b, 0) is None
         assert len(part.step) < len(whole.step)
-
-
-def test_plots_show_the_part_in_which_all_runs_are_where_they_would_be_mostly_empty() -> None:
-    long, short, late = np.linspace(0, 200, 50), np.linspace(0, 20, 50), np.linspace(30, 40, 50)
-    assert shared_part([long, short]) == shared_part([short, long]) == (0, 20)
-    assert shared_part([long, late, long]) == (30, 40)
-    assert shared_part([long, long[:40]]) is shared_part([short, late]) is shared_part([long[:1], long]) is None
 
 
 def test_data_are_the_same_by_their_sha256_and_simulations_by_seed_and_parameters(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from itertools import groupby
 import numpy as np
 import rerun.blueprint as rrb
 
-from viz_estim.core.quaternions import Array
 from viz_estim.recording import links, plot_tabs, schema
 from viz_estim.recording.compared import Compared
 from viz_estim.recording.pictures import CANVAS, PANORAMA
@@ -16,7 +15,6 @@ from viz_estim.recording.scene_views import Scenes, flat, view
 from viz_estim.recording.sheet import Plot
 
 _Item = rrb.Container | rrb.View
-_SHORT = 0.4  # of the whole: where all runs are in less of it, plots show that part
 _FEW, _MORE = 3, 4  # runs up to which a plot has room for their legend; and one that has a row for itself
 _NAMES = {"attitude": "attitude", "world": "world [m]", "bars": "probabilities", "canvas": "mosaic [deg]"}
 _TABS = {
@@ -37,12 +35,9 @@ def build(runs: list[Compared], scenes: Scenes, plots: list[Plot], ranges: Range
         plot_tabs.lanes(f"{run.path}{schema.LANES}", f"{run.title}: stage, and each sensor's readings") for run in runs
     ]
     beneath.append(rrb.Grid(*lanes, grid_columns=1 if len(runs) <= 3 else 3, name="Lanes"))
-    shared = shared_part([run.run.time for run in runs])
-    if shared:
-        notes = f"Plots show {shared[0]:g} to {shared[1]:g} s, where all runs are; zoom out for the rest.\n\n{notes}"
     beneath.append(links.panel(schema.NOTES, "What was compared", notes))
     duration = max(float(run.run.time[-1] - run.run.time[0]) for run in runs)
-    beneath = [plot_tabs.show_from(tab, *shared) if shared else plot_tabs.show_all(tab, duration) for tab in beneath]
+    beneath = [plot_tabs.show_all(tab, duration) for tab in beneath]
     tabs = rrb.Tabs(*beneath, name="over time", active_tab=0)
     rows: list[_Item] = [rrb.Tabs(*above, active_tab=0) if len(above) > 1 else above[0], tabs] if above else [tabs]
     shares = [1.0] if not above else [0.85, 1.0] if len(runs) <= 3 else [1.1, 1.0]
@@ -52,13 +47,6 @@ def build(runs: list[Compared], scenes: Scenes, plots: list[Plot], ranges: Range
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
-
-
-def shared_part(times: list[Array]) -> tuple[float, float] | None:
-    """The part (s) in which all runs are, where plots of the whole would be mostly empty; else None."""
-    start, end = max(float(t[0]) for t in times), min(float(t[-1]) for t in times)
-    whole = max(float(t[-1]) for t in times) - min(float(t[0]) for t in times)
-    return (start, end) if 0 < end - start < _SHORT * whole else None
 
 
 def _scenes(runs: list[Compared], scenes: Scenes) -> list[_Item]:

@@ -67,16 +67,6 @@ def show_all(item: _Item, duration: float) -> _Item:
     return item
 
 
-def show_from(item: _Item, start: float, end: float) -> _Item:
-    """The same, where plots show this part (s) of a run on the timeline `time`, and a little beside it."""
-    edge = 0.02 * (end - start)
-    part = TimeRange(*(rrb.TimeRangeBoundary.absolute(seconds=at) for at in (start - edge, end + edge)))
-    for view in _views(item):
-        if isinstance(view, rrb.TimeSeriesView):
-            view.properties["TimeAxis"] = rrb.TimeAxis(link="Independent", view_range=part)
-    return item
-
-
 def _views(item: _Item) -> list[rrb.View]:
     return [view for inner in item.contents for view in _views(inner)] if isinstance(item, rrb.Container) else [item]
 
