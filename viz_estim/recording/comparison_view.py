@@ -15,6 +15,7 @@ from viz_estim.recording.scene_views import Scenes, flat, view
 from viz_estim.recording.sheet import Plot
 
 _Item = rrb.Container | rrb.View
+_LOWER = 2  # times as low as in a run's own view are plots below the scenes
 _FEW, _MORE = 3, 4  # runs up to which a plot has room for their legend; and one that has a row for itself
 _NAMES = {"attitude": "attitude", "world": "world [m]", "bars": "probabilities", "canvas": "mosaic [deg]"}
 _TABS = {
@@ -87,24 +88,26 @@ def _tabs(title: str, plots: list[Plot], ranges: Ranges, runs: int, *, named: bo
     found: list[_Item] = []
     for i in range(0, len(rows), size):
         shown: set[int] = set()
-        lines = []
-        for row in rows[i : i + size]:
+        lines, tab = [], rows[i : i + size]
+        for row in tab:
             roomy = runs <= _FEW or (len(row) == 1 and runs <= _MORE)
             line = []
             for plot in row:
                 new = not plot.runs <= shown
-                line.append(_plot(plot, ranges, legend=new and (roomy or not named)))
+                line.append(_plot(plot, ranges, rows=_LOWER * len(tab), legend=new and (roomy or not named)))
                 shown |= plot.runs
             lines.append(rrb.Horizontal(*line))
         found.append(rrb.Vertical(*lines, name=f"{title} {len(found) + 1}" if found else title))
     return found
 
 
-def _plot(plot: Plot, ranges: Ranges, *, legend: bool) -> rrb.TimeSeriesView:
+def _plot(plot: Plot, ranges: Ranges, *, rows: float, legend: bool) -> rrb.TimeSeriesView:
+    """rows: of plots, as many as have their height in a run's own view."""
+    ranges.ask(plot.path)
     return rrb.TimeSeriesView(
         origin=plot.path,
         name=plot.title,
-        axis_y=ranges.axis(plot.path) if plot.top is None else rrb.ScalarAxis(range=(0.0, plot.top)),
+        axis_y=ranges.asked(plot.path, rows) if plot.top is None else rrb.ScalarAxis(range=(0.0, plot.top)),
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
         plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
     )

@@ -22,6 +22,7 @@ _ROOM = 0.25  # of what most need, above and below it
 _KEPT = 4096  # rows of a plot, at most; more are thinned evenly
 _NUMBERS, _ROWS = 7.0, 3  # steps of a power of ten that are still named on a low plot, one of so many rows
 _EDGE = 0.03  # of the axis, beyond the last value
+_HALF_A_NUMBER = 0.1  # of the axis of such a plot: a number nearer to its upper end is cut off
 
 
 class Ranges:
@@ -48,7 +49,7 @@ class Ranges:
         if path in self._seen:
             self._find[path] = partial(self._seen[path].range, calm)
 
-    def asked(self, path: str, rows: int = _ROWS) -> rrb.ScalarAxis | None:
+    def asked(self, path: str, rows: float = _ROWS) -> rrb.ScalarAxis | None:
         """The axis that was asked for of a plot, one of so many rows: on a high plot more numbers are named. None where
         nothing is known, or all is one value."""
         found = self._find[path](_ROWS * _NUMBERS / rows) if self.fixed and path in self._find else None
@@ -137,5 +138,7 @@ def readable(low: float, high: float, numbers: float = _NUMBERS) -> _Range:
             high, above = above, above + step
         else:
             low, below = below, below - step
-    edge = _EDGE * (high - low)
-    return float(low - edge), float(high + edge)
+    length = high - low
+    above = high - np.floor(high / step) * step
+    room = max(_EDGE * length, _HALF_A_NUMBER * _NUMBERS / numbers * length - above)
+    return float(low - _EDGE * length), float(high + room)
