@@ -26,7 +26,7 @@ _OF_CLOUDS = {
     "ess": "effective sample size before resampling",
     "distinct": "distinct ancestors",
 }
-_OF_FITS = {"rmse": "RMSE of the matches [m]", "count": "matches", "converged": "1 when the matches repeat"}
+_OF_FITS = {"rmse": "RMSE [m]", "count": "matches", "converged": "settled (0 or 1)"}
 _COUNTED = ("ess", "distinct")  # of all particles
 _TOPS = {"converged": 1}
 
