@@ -15,19 +15,9 @@ from viz_estim.diagnosis.axes import inverses, maps
 from viz_estim.diagnosis.durations import composed, whole
 from viz_estim.diagnosis.evidence import Case, once
 from viz_estim.diagnosis.finding import (
-    EXPLAINED,
-    FEWEST,
-    GROSS,
-    HALF_THE_DIGITS,
-    ODDS,
-    SHEET,
-    TINY,
-    WINDOW,
-    Chance,
-    Finding,
-    by_ratio,
-    judge,
-)
+    EXPLAINED, FEWEST, GROSS, HALF_THE_DIGITS, ODDS, SHEET, TINY, WINDOW, Chance,
+    Finding, by_ratio, judge,
+)  # fmt: skip
 from viz_estim.diagnosis.fits import slope
 from viz_estim.diagnosis.linear import transitions
 from viz_estim.diagnosis.naming import SIGNS, likeliest, named, of_motion
