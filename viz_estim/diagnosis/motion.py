@@ -15,8 +15,18 @@ from viz_estim.diagnosis.axes import inverses, maps
 from viz_estim.diagnosis.durations import composed, whole
 from viz_estim.diagnosis.evidence import Case, once
 from viz_estim.diagnosis.finding import (
-    EXPLAINED, FEWEST, GROSS, HALF_THE_DIGITS, ODDS, SHEET, TINY, WINDOW, Chance,
-    Finding, by_ratio, judge,
+    EXPLAINED,
+    FEWEST,
+    GROSS,
+    HALF_THE_DIGITS,
+    ODDS,
+    SHEET,
+    TINY,
+    WINDOW,
+    Chance,
+    Finding,
+    by_ratio,
+    judge,
 )  # fmt: skip
 from viz_estim.diagnosis.fits import slope
 from viz_estim.diagnosis.linear import transitions
@@ -90,26 +100,24 @@ def prediction(case: Case) -> Iterator[Finding]:
     headings = [case.space.at[name] for name, part in case.space.parts.items() if isinstance(part, SO2)]
     for name, part in case.space.parts.items():
         axes = range(case.space.axes_at[name].start, case.space.axes_at[name].stop)
-        if isinstance(part, SO3) and all(i in moving and len(moving[i][0]) == len(moving[axes[0]][0]) for i in axes):
-            truly, told = (np.stack([moving[i][k] for i in axes], axis=-1) for k in (0, 1))
-            if (found := _turns_as(name, truly, told, moving[axes[0]][2])) is not None:
-                yield found
-                return
-        if isinstance(part, Euclidean) and len(set(part.axis_units)) == 1 and 2 <= len(axes) <= 3 and all(
-            i in moving and np.array_equal(moving[i][2], moving[axes[0]][2]) for i in axes
-        ):  # fmt: skip
-            truly, told = (np.stack([moving[i][k] for i in axes], axis=-1) for k in (0, 1))
-            of = moving[axes[0]][2]
+        if not all(i in moving and np.array_equal(moving[i][2], moving[axes[0]][2]) for i in axes):
+            continue
+        truly, told = (np.stack([moving[i][k] for i in axes], axis=-1) for k in (0, 1))
+        of, found = moving[axes[0]][2], None
+        if isinstance(part, SO3):
+            found = _turns_as(name, truly, told, of)
+        elif isinstance(part, Euclidean) and len(set(part.axis_units)) == 1 and 2 <= len(axes) <= 3:
             heading = run.truth[np.searchsorted(run.step, of) - 1, headings[0]][:, 0] if len(headings) == 1 else None
             heading = heading if heading is not None and np.isfinite(heading).all() else None
-            if (found := directions.turned(name, truly, told, heading, of)) is not None:
-                yield found
-                return
+            found = directions.turned(name, truly, told, heading, of)
             own = {name if axis in ("", name) else f"{name} {axis}" for axis in part.axes}
             told_of = [
                 (share, directions.of_all(f, name, truly, told) if f.evidence["component"] in own else f)
                 for share, f in told_of
             ]
+        if found is not None:
+            yield found
+            return
     yield from _best(told_of) if told_of else map(_by_estimate, _elsewhere(case))
 
 
