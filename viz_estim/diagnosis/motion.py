@@ -9,9 +9,8 @@ import numpy as np
 
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, Euclidean, wrap
-from viz_estim.diagnosis import clouds, directions, forces
+from viz_estim.diagnosis import clouds, directions, forces, turning
 from viz_estim.diagnosis.against import slip as bound
-from viz_estim.diagnosis.axes import inverses, maps
 from viz_estim.diagnosis.durations import composed, whole
 from viz_estim.diagnosis.evidence import Case, once
 from viz_estim.diagnosis.finding import (
@@ -31,9 +30,11 @@ from viz_estim.diagnosis.finding import (
 from viz_estim.diagnosis.fits import slope
 from viz_estim.diagnosis.linear import transitions
 from viz_estim.diagnosis.naming import SIGNS, likeliest, named, of_motion
+from viz_estim.recording.tables import StageTable
 from viz_estim.scenarios.imu_health import GRAVITY
 
-_WORLD = "the world's axes"
+_Told = list[tuple[float, Finding]]
+_Moving = dict[int, tuple[Array, Array, np.ndarray]]  # by component: the truth's motion, the predicted one, and steps
 
 
 def predictions(case: Case) -> list[Finding]:
@@ -56,7 +57,7 @@ def prediction(case: Case) -> Iterator[Finding]:
     moves = [(table, F) for table in run.stages.values() if (F := transitions(case, table)) is not None]
     if not np.isfinite(run.truth).any():
         return
-    if by_imu := [*forces.forces(case), *_turned(case)]:  # by an accelerometer, by a gyro, or by both
+    if by_imu := [*forces.forces(case), *turning.turned(case)]:  # by an accelerometer, by a gyro, or by both
         yield replace(by_imu[0], cause="; and ".join(f.cause for f in by_imu))
         return
     moved = clouds.moves_of_means(case)
@@ -66,7 +67,19 @@ def prediction(case: Case) -> Iterator[Finding]:
     if len(moves) != 1:
         yield from map(_by_estimate, _elsewhere(case))
         return
-    (table, F), row = moves[0], {int(step): k for k, step in enumerate(run.step)}
+    told_of, moving = _by_component(case, *moves[0])
+    for name in case.space.parts:
+        found, told_of = _as_a_whole(case, name, moving, told_of)
+        if found is not None:
+            yield found
+            return
+    yield from _best(told_of) if told_of else map(_by_estimate, _elsewhere(case))
+
+
+def _by_component(case: Case, table: StageTable, F: Array) -> tuple[_Told, _Moving]:
+    """What is wrong with a component's motion in a stage with the transitions F (M, d, d), and how much that explains;
+    and the motions of components by number."""
+    run, row = case.run, {int(step): k for k, step in enumerate(case.run.step)}
     by = whole(case, table)
     before, step, F = by.before, by.step, composed(F, by)
     at = np.array([row[int(k)] for k in step])
@@ -77,7 +90,7 @@ def prediction(case: Case) -> Iterator[Finding]:
     needed = np.asarray((size > HALF_THE_DIGITS * size.max(2, keepdims=True)).any(0))  # to what F is known
     d = len(case.space.axes)
     told_of: list[tuple[float, Finding]] = []
-    moving: dict[int, tuple[Array, Array, np.ndarray]] = {}
+    moving: _Moving = {}
     parts = [(name, i) for name, axes in case.space.axes_at.items() for i in range(axes.start, axes.stop)]
     for name, i in parts:
         known = np.asarray(np.isfinite(error[:, needed[i]]).all(1) & np.isfinite(after[:, i]) & ok)
@@ -97,43 +110,36 @@ def prediction(case: Case) -> Iterator[Finding]:
             axis, unit = case.space.axes[i].rpartition(".")[2], case.space.axis_units[i]
             label = name if axis in ("", name, "angle") else f"{name} {axis}"
             told_of += _moves_as(label, unit, of, w[near], told[near], dt[near], slip[near], 2 * d, by.times)
-    headings = [case.space.at[name] for name, part in case.space.parts.items() if isinstance(part, SO2)]
-    for name, part in case.space.parts.items():
-        axes = range(case.space.axes_at[name].start, case.space.axes_at[name].stop)
-        if not all(i in moving and np.array_equal(moving[i][2], moving[axes[0]][2]) for i in axes):
-            continue
-        truly, told = (np.stack([moving[i][k] for i in axes], axis=-1) for k in (0, 1))
-        of, found = moving[axes[0]][2], None
-        if isinstance(part, SO3):
-            found = _turns_as(name, truly, told, of)
-        elif isinstance(part, Euclidean) and len(set(part.axis_units)) == 1 and 2 <= len(axes) <= 3:
-            heading = run.truth[np.searchsorted(run.step, of) - 1, headings[0]][:, 0] if len(headings) == 1 else None
-            heading = heading if heading is not None and np.isfinite(heading).all() else None
-            found = directions.turned(name, truly, told, heading, of)
-            own = {name if axis in ("", name) else f"{name} {axis}" for axis in part.axes}
-            told_of = [
-                (share, directions.of_all(f, name, truly, told) if f.evidence["component"] in own else f)
-                for share, f in told_of
-            ]
-        if found is not None:
-            yield found
-            return
-    yield from _best(told_of) if told_of else map(_by_estimate, _elsewhere(case))
+    return told_of, moving
+
+
+def _as_a_whole(case: Case, name: str, moving: _Moving, told_of: _Told) -> tuple[Finding | None, _Told]:
+    """Of an attitude or a vector, what is wrong with its motion in all directions together; and what is told of each
+    component, as far as it is of all."""
+    run, part = case.run, case.space.parts[name]
+    axes = range(case.space.axes_at[name].start, case.space.axes_at[name].stop)
+    if not all(i in moving and np.array_equal(moving[i][2], moving[axes[0]][2]) for i in axes):
+        return None, told_of
+    truly, told = (np.stack([moving[i][k] for i in axes], axis=-1) for k in (0, 1))
+    of = moving[axes[0]][2]
+    if isinstance(part, SO3):
+        return turning.turns_as(name, truly, told, of), told_of
+    if not (isinstance(part, Euclidean) and len(set(part.axis_units)) == 1 and 2 <= len(axes) <= 3):
+        return None, told_of
+    headings = [case.space.at[other] for other, of_it in case.space.parts.items() if isinstance(of_it, SO2)]
+    heading = run.truth[np.searchsorted(run.step, of) - 1, headings[0]][:, 0] if len(headings) == 1 else None
+    heading = heading if heading is not None and np.isfinite(heading).all() else None
+    own = {name if axis in ("", name) else f"{name} {axis}" for axis in part.axes}
+    of_all = [
+        (share, directions.of_all(f, name, truly, told) if f.evidence["component"] in own else f)
+        for share, f in told_of
+    ]
+    return directions.turned(name, truly, told, heading, of), of_all
 
 
 def _by_estimate(finding: Finding) -> Finding:
     """Marked, for the mean may be moved by what it holds too, a bias or a rate, which wrong readings have taught it."""
     return replace(finding, evidence=finding.evidence | {"by_estimate": True})
-
-
-def _turned(case: Case) -> Iterator[Finding]:
-    """An attitude that is turned by other axes or units, or about the world's axes: step by step, or by window."""
-    for window in (0.0, WINDOW):
-        if (found := clouds.turns_of_means(case, window)) is not None:
-            name, (of, truly, told), in_world = found
-            if (finding := _turns_as(name, truly, told, of, in_world)) is not None:
-                yield finding
-                return
 
 
 def _elsewhere(case: Case) -> Iterator[Finding]:
@@ -203,42 +209,6 @@ def _best(told_of: list[tuple[float, Finding]]) -> Iterator[Finding]:
 def order(unit: str) -> int:
     """Which derivative a unit is of, by its seconds: of m/s² the second."""
     return 2 if unit.endswith("/s²") else 1 if unit.endswith("/s") else 0
-
-
-def _turns_as(name: str, truly: Array, told: Array, of: np.ndarray, in_world: Array | None = None) -> Finding | None:
-    """The map of the rates' axes, or the unit, by which what is predicted (M, 3) is what happens (M, 3); or that it is
-    predicted in the world's axes (M, 3)."""
-    own = float(np.square(truly - told).sum())
-    # In what was predicted, whose size stays as it is: a unit that makes it small explains nothing by that.
-    tried = [
-        (float(np.square(told - truly @ back).sum()), title, told @ A.T)
-        for (title, A), (_, back) in zip(maps(3, "rad/s"), inverses(3, "rad/s"), strict=True)
-    ]
-    if in_world is not None:
-        tried.append((float(np.square(truly - in_world).sum()), _WORLD, in_world))
-    best, what, mapped = min(tried, key=lambda one: one[0])
-    gain, explained = 0.5 * truly.size * np.log(own / max(best, TINY)), 1 - best / max(own, TINY)
-    # Either way, so that noise of neither passes for a unit that makes it small.
-    back = float(np.square(truly - mapped).sum())
-    if what != _WORLD and not (forces.foreseen(told, best) and forces.foreseen(truly, back)):
-        return None
-    if explained < EXPLAINED or judge(by_ratio(gain), len(tried), large=True) != "error":
-        return None
-    if what == _WORLD:
-        return Finding(
-            "process_model", "error", None, (int(of[0]), int(of[-1])),
-            {"component": name, "map": what, "explained": explained, "against": "truth"},
-            f"{name} is predicted to turn about the world's axes by what the body turns by about its own: this "
-            f"explains {explained:.0%} of the difference",
-            "multiply by a turn of the body's rates from the right, q·Exp(ω·dt), where q is world from body",
-        )  # fmt: skip
-    words = f"its rates as {what}" if what.startswith("axes") else f"a factor ({what})"
-    return Finding(
-        "process_model", "error", None, (int(of[0]), int(of[-1])),
-        {"component": name, "map": what, "explained": explained, "against": "truth"},
-        f"{name} is predicted to turn otherwise than it does: {words} would explain {explained:.0%} of the difference",
-        f"check the order, the signs and the unit of the rates that turn {name}: the best map is `{what}`",
-    )  # fmt: skip
 
 
 def _moves_as(
