@@ -100,7 +100,10 @@ def _innovations(alone: Alone, ranges: Ranges) -> list[_Plots]:
             top = ranges.upward(schema.plot("nis", name), 4 * band(dof)[1])
             views = [graph("nis", name, f"NIS {name}", top)]
             for axis, unit in zip(part.axes, part.axis_units, strict=True):
-                views.append(_framed(ranges, "innovation", f"{name}.{axis}", titled(name, axis, shown(unit)[0])))
+                of = (
+                    name if dof != 3 else ""
+                )  # beside its NIS, which names it, three have no room for both name and unit
+                views.append(_framed(ranges, "innovation", f"{name}.{axis}", titled(of, axis, shown(unit)[0]).strip()))
             groups.append(views)
     return groups
 
