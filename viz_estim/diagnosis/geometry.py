@@ -9,7 +9,7 @@ import numpy as np
 from viz_estim.core.distributions import norm
 from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import SO2, SO3, Euclidean, Product, Space, wrap
-from viz_estim.diagnosis.axes import explains, finding_of, inverses, maps, units
+from viz_estim.diagnosis.axes import explains, finding_of, inverses, units
 from viz_estim.diagnosis.evidence import Case, Readings, tells_reading
 from viz_estim.diagnosis.finding import FEWEST, GROSS, HALF_THE_DIGITS, SHEET, TINY, Finding, level
 from viz_estim.diagnosis.fits import slope
@@ -181,16 +181,16 @@ def singled_out(z: Array, predicted: Array, precision: Array, what: str, unit: s
     """Whether of all factors known, and none, the map alone brings what was expected (M, m) to the readings (M, m). The
     factor lies between the slope of the one on the other and that of the other on the one, each with its error. Of an
     estimate that has gone elsewhere, that is far: then readings tell nothing of their unit."""
-    M = dict(maps(z.shape[1], unit))[what]
+    back = dict(inverses(z.shape[1], unit))[what]
     if not (np.linalg.eigvalsh(precision)[:, 0] > 0).all():
         return False
     L = np.linalg.cholesky(precision)
-    y, x = (np.einsum("tji,tj->ti", L, v).ravel() for v in (z, predicted @ np.linalg.inv(M).T))
-    forth, back = slope(y, x), slope(x, y)
-    if forth.value <= 0 or back.value <= 0:
+    y, x = (np.einsum("tji,tj->ti", L, v).ravel() for v in (z, predicted @ back))
+    forth, aback = slope(y, x), slope(x, y)
+    if forth.value <= 0 or aback.value <= 0:
         return False
-    low, high = sorted((np.log(forth.value), -np.log(back.value)))
-    wide = FAR * max(forth.error / forth.value, back.error / back.value) + SHEET
+    low, high = sorted((np.log(forth.value), -np.log(aback.value)))
+    wide = FAR * max(forth.error / forth.value, aback.error / aback.value) + SHEET
     scale = 1.0 if what.startswith("axes") else units(unit)[what]
     others = [0.0 if what.startswith("axes") else np.log(scale), *(np.log(scale / f) for f in units(unit).values())]
     known = wide < np.log(GROSS) and low - wide < 0 < high + wide

@@ -103,11 +103,10 @@ def _tabs(title: str, plots: list[Plot], ranges: Ranges, runs: int, *, named: bo
 
 def _plot(plot: Plot, ranges: Ranges, *, rows: float, legend: bool) -> rrb.TimeSeriesView:
     """rows: of plots, as many as have their height in a run's own view."""
-    ranges.ask(plot.path)
     return rrb.TimeSeriesView(
         origin=plot.path,
         name=plot.title,
-        axis_y=ranges.asked(plot.path, rows) if plot.top is None else rrb.ScalarAxis(range=(0.0, plot.top)),
+        axis_y=ranges.axis(plot.path, rows=rows) if plot.top is None else rrb.ScalarAxis(range=(0.0, plot.top)),
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
         plot_legend=rrb.PlotLegend("LeftTop", visible=legend),
     )

@@ -100,10 +100,9 @@ def _innovations(alone: Alone, ranges: Ranges) -> list[_Plots]:
             top = ranges.upward(schema.plot("nis", name), 4 * band(dof)[1])
             views = [graph("nis", name, f"NIS {name}", top)]
             for axis, unit in zip(part.axes, part.axis_units, strict=True):
-                of = (
-                    name if dof != 3 else ""
-                )  # beside its NIS, which names it, three have no room for both name and unit
-                views.append(_framed(ranges, "innovation", f"{name}.{axis}", titled(of, axis, shown(unit)[0]).strip()))
+                # Beside their NIS, which names the sensor, three have no room for that and a unit.
+                title = f"{axis} [{shown(unit)[0]}]" if dof == 3 and unit else titled(name, axis, shown(unit)[0])
+                views.append(_framed(ranges, "innovation", f"{name}.{axis}", title))
             groups.append(views)
     return groups
 

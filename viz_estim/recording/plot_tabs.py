@@ -29,6 +29,7 @@ _OF_CLOUDS = {
 _OF_FITS = {"rmse": "RMSE [m]", "count": "matches", "converged": "settled (0 or 1)"}
 _COUNTED = ("ess", "distinct")  # of all particles
 _TOPS = {"converged": 1}
+_ERRORS = 3  # in a row, of parts of one or two axes
 
 
 def figure_names(fields: list[str], *, fit: bool, particles: int | None) -> dict[str, str]:
@@ -43,8 +44,10 @@ def figures_once(stages: dict[str, list[str]]) -> dict[str, list[str]]:
     """By stage the single numbers to show: of a resampling not the effective sample size that it found, where the
     weighing before it has told the same."""
     weighed = any("ess" in fields and "distinct" not in fields for fields in stages.values())
-    twice = {"ess"} if weighed else set[str]()
-    return {s: [f for f in fields if not (f in twice and "distinct" in fields)] for s, fields in stages.items()}
+    return {
+        stage: [f for f in fields if not (weighed and f == "ess" and "distinct" in fields)]
+        for stage, fields in stages.items()
+    }
 
 
 def lanes(origin: str, name: str) -> rrb.StateTimelineView:
@@ -109,9 +112,6 @@ def _health(layout: Layout) -> list[_Item]:
     """Is the filter right, and does it know: errors, innovations, NIS; the innovations in a tab of their own where one
     would be crowded, and NIS with them where the errors alone crowd one."""
     parts = {name: part for name, part in layout.space.parts.items() if name in layout.true_parts}
-    errors = _each(layout, "error", parts, " error", most=3)
-    what = " innov." if len(layout.sensors) < 4 else ""  # four in a row leave no place for the word
-    innovations = _each(layout, "innovation", layout.sensors, what)
     bands: list[_Item] = []
     for name, space in layout.sensors.items():
         dof = len(space.axes)
@@ -120,18 +120,24 @@ def _health(layout: Layout) -> list[_Item]:
         bands.append(graph("nis", name, title, axis))
     nis = _rows(bands)
     whole, bounds = "Consistency", ", ±3σ grey"
-    if len(errors) + len(innovations) + len(nis) <= _READABLE:
+    beside_nis = len(_groups(_widths(parts), _ERRORS)) + len(nis)  # rows
+    in_one = beside_nis + len(_groups(_widths(layout.sensors))) <= _READABLE
+    in_two = bool(parts) and beside_nis <= _READABLE
+    # In a tab of their own the tab says what they are; and four in a row leave no place for the word.
+    errors = _each(layout, "error", parts, " error" if in_one or in_two else "", most=_ERRORS)
+    what = " innov." if in_one and len(layout.sensors) < 4 else ""
+    innovations = _each(layout, "innovation", layout.sensors, what)
+    if in_one:
         rows = [*errors, *innovations, *nis]
         return [rrb.Vertical(*rows, name=whole + bounds)] if rows else []
-    innovations = _each(layout, "innovation", layout.sensors, "")  # the tab says what they are
-    if errors and len(errors) + len(nis) <= _READABLE:
+    if in_two:
         return [
             rrb.Vertical(*errors, *nis, name=whole + bounds),
             *_in_tabs(innovations, "Innovations" + bounds, "Innovations"),
         ]
     return [
         *_in_tabs([*innovations, *nis], "Innovations" + bounds, "Innovations"),
-        *_in_tabs(_each(layout, "error", parts, "", most=3), "Errors" + bounds, "Errors"),
+        *_in_tabs(errors, "Errors" + bounds, "Errors"),
     ]
 
 
@@ -142,7 +148,11 @@ def _each(layout: Layout, group: str, parts: Mapping[str, Space], what: str, mos
         for name, part in parts.items()
         for i, axis in enumerate(part.axes)
     ]
-    return _rows(views, [len(part.axes) for part in parts.values()], most)
+    return _rows(views, _widths(parts), most)
+
+
+def _widths(parts: Mapping[str, Space]) -> list[int]:
+    return [len(part.axes) for part in parts.values()]
 
 
 def _figures(layout: Layout) -> list[_Item]:
@@ -211,19 +221,24 @@ def _in_tabs(rows: list[_Item], first: str, others: str) -> list[_Item]:
 
 
 def _rows(views: Sequence[_Item], widths: list[int] | None = None, most: int = 4) -> list[_Item]:
-    """The views in rows of at most four; those that belong together (`widths` of them) stay in one row, and few of them
-    join the row before if that makes at most `most`."""
-    groups: list[list[_Item]] = []
+    """The views in rows, those that belong together (`widths` of them) as `_groups` puts them."""
+    return [rrb.Horizontal(*(views[i] for i in group)) for group in _groups(widths or [len(views)], most)]
+
+
+def _groups(widths: list[int], most: int = 4) -> list[list[int]]:
+    """By row the numbers of its views, at most four; those that belong together stay in one row, and few of them join
+    the row before if that makes at most `most`."""
+    groups: list[list[int]] = []
     start = 0
-    for width in widths or [len(views)]:
-        group = list(views[start : start + width])
+    for width in widths:
+        group = list(range(start, start + width))
         start += width
         if groups and len(groups[-1]) + width <= most and width < 3:
             groups[-1] += group
         else:
             across = 3 if width % 3 == 0 or width == 5 else 4
             groups += [group[i : i + across] for i in range(0, width, across)]
-    return [rrb.Horizontal(*group) for group in groups]
+    return groups
 
 
 def _sigmas(layout: Layout) -> list[_Item]:

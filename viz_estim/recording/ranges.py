@@ -55,10 +55,10 @@ class Ranges:
         found = self._find[path](_ROWS * _NUMBERS / rows) if self.fixed and path in self._find else None
         return rrb.ScalarAxis(range=found) if found else None
 
-    def axis(self, path: str, calm: float = _CALM) -> rrb.ScalarAxis | None:
+    def axis(self, path: str, calm: float = _CALM, rows: float = _ROWS) -> rrb.ScalarAxis | None:
         """Both at once."""
         self.ask(path, calm)
-        return self.asked(path)
+        return self.asked(path, rows)
 
     def upward(self, path: str, top: float) -> rrb.ScalarAxis:
         """The axis from 0 to `top` of a plot that has level lines, or as far up as its values are, where most of them
