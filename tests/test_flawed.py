@@ -1,7 +1,7 @@
 """The gallery of broken filters: each is found by its proper code. The table is printed (pytest -s)."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,7 +16,10 @@ from viz_estim.diagnose import CODES, diagnose
 from viz_estim.running import find
 from viz_estim.scenarios.flawed import FLAWED
 
-SEEDS = 10
+# A sequential test, as Wald's (1947): five hits in a row end a flaw's trial; after a miss all ten seeds are run, of which
+# nine must hit. A flaw found half the time passes in 4 % of such trials, one found in 99 % fails in 0.3 %; were all
+# seeds always run, in 1 and 0.4 %, for twice the time. `python tests/bench/gallery.py` runs twenty seeds of each.
+IN_A_ROW, SEEDS = 5, 10
 # Simulations as short as the flaws allow.
 SHORT: dict[str, dict[str, Any]] = {
     "imu": {"duration": 3.4, "still": 0.6, "freeze": 0.0},
@@ -82,34 +85,48 @@ def simulated(data: Callable[..., Any], seed: int, options: tuple[tuple[str, Any
     return data(None, np.random.default_rng(seed), **dict(options))
 
 
-def found(name: str) -> list[set[str]]:
+def found(name: str, seeds: Sequence[int]) -> list[set[str]]:
     """By seed, the codes that a flaw is found by, notes left out."""
     flaw = FLAWED[name]
     system = flaw.system.__name__.rpartition(".")[2]
     options = SHORT[system] | OTHER.get(name, {})
     scenarios = []
-    for seed in range(SEEDS):
+    for seed in seeds:
         scenario = flaw.scenario(simulated(flaw.data, seed, tuple(options.items())))
         scenarios.append(replace(scenario, ticks=scenario.ticks[: STEPS.get(name)]))
-    runs = together(scenarios, range(SEEDS))
+    runs = together(scenarios, seeds)
     codes = [{finding.code for finding in diagnose(run) if finding.severity != "note"} for run in runs]
     assert set().union(*codes) <= CODES.keys()
     return codes
 
 
+def tried(name: str) -> list[set[str]]:
+    """What is found in a flaw's trial: of the first seeds, and of all of them where it missed once."""
+    codes = found(name, range(IN_A_ROW))
+    if not all(FLAWED[name].code in seed for seed in codes):
+        codes += found(name, range(IN_A_ROW, SEEDS))
+    return codes
+
+
+def table(codes: dict[str, list[set[str]]]) -> str:
+    """By flaw, how often it is found by its code, and what else is said."""
+    lines = [f"{'flaw':32}{'code':22}found  beside it"]
+    for name, seeds in codes.items():
+        count = Counter(code for seed in seeds for code in seed)
+        hits = count.pop(FLAWED[name].code, 0)
+        others = ", ".join(f"{code} {times}" for code, times in count.most_common())
+        lines.append(f"{name:32}{FLAWED[name].code:22}{hits:2}/{len(seeds):<4}{others}")
+    return "\n".join(lines)
+
+
 @pytest.mark.long
 def test_each_flaw_is_found_by_its_code() -> None:
     assert len(FLAWED) >= 20
-    hits, lines = {}, [f"{'flaw':32}{'code':22}found  beside it"]
-    for name, flaw in FLAWED.items():
-        codes = Counter(code for seed in found(name) for code in seed)
-        hits[name] = codes.pop(flaw.code, 0)
-        others = ", ".join(f"{code} {count}" for code, count in codes.most_common())
-        lines.append(f"{name:32}{flaw.code:22}{hits[name]:2}/{SEEDS}  {others}")
-    table = "\n".join(lines)
-    print(f"\n{table}")
-    assert min(hits.values()) >= 9, table
-    assert sum(hits.values()) >= 0.95 * SEEDS * len(hits), table
+    codes = {name: tried(name) for name in FLAWED}
+    print(f"\n{table(codes)}")
+    misses = {name: sum(FLAWED[name].code not in seed for seed in seeds) for name, seeds in codes.items()}
+    assert max(misses.values()) <= SEEDS // 10, table(codes)
+    assert sum(misses.values()) <= 0.05 * sum(map(len, codes.values())), table(codes)
 
 
 def test_every_flaw_is_a_scenario_with_a_description_over_its_system_s_data() -> None:
