@@ -16,9 +16,9 @@ from viz_estim.diagnose import CODES, diagnose
 from viz_estim.running import find
 from viz_estim.scenarios.flawed import FLAWED
 
-# A sequential test, as Wald's (1947): five hits in a row end a flaw's trial; after a miss all ten seeds are run, of which
-# nine must hit. A flaw found half the time passes in 4 % of such trials, one found in 99 % fails in 0.3 %; were all
-# seeds always run, in 1 and 0.4 %, for twice the time. `python tests/bench/gallery.py` runs twenty seeds of each.
+# A sequential test, as Wald's (1947): five hits in a row end a flaw's trial; after a miss all ten seeds are run, of
+# which nine must hit. A flaw found half the time passes in 4 % of such trials, one found in 99 % fails in 0.3 %; were
+# all seeds always run, in 1 and 0.4 %, for twice the time. `python tests/bench/gallery.py` runs twenty seeds of each.
 IN_A_ROW, SEEDS = 5, 10
 # Simulations as short as the flaws allow.
 SHORT: dict[str, dict[str, Any]] = {

@@ -1,4 +1,4 @@
-"""How often each flaw of the gallery is found by its code: `python tests/bench/gallery.py [FLAW ...]`, twenty seeds each.
+"""How often each flaw of the gallery is found: `python tests/bench/gallery.py [FLAW ...]`, twenty seeds each.
 
 The tests end a flaw's trial after five hits in a row; this prints the whole table. It takes some five minutes.
 """
