@@ -1,5 +1,6 @@
 """How recordings end: well, by a failure, by a kill; and files that are none. What was there before stays."""
 
+import contextlib
 import json
 import os
 import signal
@@ -14,12 +15,17 @@ import pytest
 import rerun as rr
 import rerun_cli  # type: ignore[import-untyped]
 from conftest import Cli
+from rerun.chunk import RrdReader
 
 import viz_estim
+from viz_estim.core.beliefs import Gaussian
+from viz_estim.core.run import Scenario, Step, Tick
+from viz_estim.core.spaces import Euclidean
+from viz_estim.core.stages import Stage
 from viz_estim.errors import BadInput
 from viz_estim.files import claimed
 from viz_estim.recording.reader import load
-from viz_estim.recording.recorder import partial_of
+from viz_estim.recording.recorder import Recorder, partial_of
 from viz_estim.recording.rescue import last_whole, whole
 from viz_estim.recording.tables import StageTable
 
@@ -273,6 +279,21 @@ def test_a_step_that_lacks_a_stage_is_not_whole(places: list[list[int]], last: i
     ]
     assert last_whole([np.array([0]), np.array([1, 2])], tables) == last
     assert last_whole([np.array([0, 1, 2])], tables) == (2 if last == 2 else -1)
+
+
+@pytest.mark.parametrize("ended", ["well", "by an exception"])
+def test_a_run_too_short_for_a_second_batch_has_its_view(ended: str, tmp_path: Path) -> None:
+    space = Euclidean(["x"], "m")
+    beliefs = [Gaussian(space, np.full(1, float(k)), np.eye(1)) for k in range(3)]
+    scenario = Scenario(None, {0: beliefs[0]}, [Tick(float(k), 1.0) for k in range(3)])  # type: ignore[arg-type]
+    fate = contextlib.nullcontext() if ended == "well" else pytest.raises(KeyError)
+    path = tmp_path / "a.rrd"
+    with fate, Recorder(path, scenario, {}) as recorder:
+        for k, belief in enumerate(beliefs):
+            recorder.add(Step(k, scenario.ticks[k], (Stage("think", belief),)))
+        if ended != "well":
+            raise KeyError
+    assert len(RrdReader(path if ended == "well" else partial_of(path)).blueprints()) == 1
 
 
 def test_two_runs_do_not_write_one_file(cli: Cli, tmp_path: Path) -> None:

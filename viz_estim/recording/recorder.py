@@ -156,6 +156,7 @@ class Recorder:
     def abort(self) -> None:
         """Ends the recording where it is; the partial file stays."""
         self._stop()
+        self._show()
         self._disconnect()
 
     def __enter__(self) -> Recorder:
@@ -231,7 +232,8 @@ class Recorder:
         self._standing.clear(batch)
         self._plots.add(batch)
         self._pictures.add(batch)
-        self._show()
+        if not self._closed.is_set():  # at the end the view is built anew from all that came
+            self._show()
         if error := steps[-1].error:  # a failure is a run's last step
             text = f"step {error.step}, {failed_where(error.stage)}: {error.message}"
             last = batch.times.pick(np.array([-1]))

@@ -194,16 +194,31 @@ class _Set:
 
     def turn_error(self, constants: Calibration, offset: float) -> Array:
         """What the truth turned by beyond the gyro over each window: Log((∏ Exp(ω·dt))⁻¹·q_begin⁻¹·q_end) (W, 3)."""
+        return _between(self.turned(constants), self.true_turn(offset))
+
+    def turned(self, constants: Calibration) -> Array:
+        """How the body turned over each window by the gyro: ∏ Exp(ω·dt) (W, 4)."""
         turns = quaternions.exp(constants.gyro(self.counts) * self.dt[..., None])
         turned = turns[:, 0]
         for step in range(1, turns.shape[1]):
             turned = multiply(turned, turns[:, step])
-        q = [quaternions.slerp(t + offset, self.log.truth_stamps, self.log.truth) for t in (self.begin, self.end)]
-        return quaternions.log(multiply(conjugate(turned), multiply(conjugate(q[0]), q[1])))
+        return turned
+
+    def true_turn(self, offset: float) -> Array:
+        """How it turned by the truth: q_begin⁻¹·q_end (W, 4)."""
+        begin, end = (
+            quaternions.slerp(t + offset, self.log.truth_stamps, self.log.truth) for t in (self.begin, self.end)
+        )
+        return multiply(conjugate(begin), end)
 
     def gravity(self, offset: float) -> Array:
         """What the accelerometer would read at rest, by the truth (T, 3), m/s²; NaN where there is none."""
         return quaternions.rotate(conjugate(truth_at(self.log.stamps, self.log, offset)), np.array([0.0, 0.0, GRAVITY]))
+
+
+def _between(turned: Array, true: Array) -> Array:
+    """What a true turn (W, 4) goes beyond another (W, 4) by, as a rotation vector (W, 3)."""
+    return quaternions.log(multiply(conjugate(turned), true))
 
 
 def _fit_gyro(sets: list[_Set], names: str) -> tuple[list[Array], list[Array]]:
@@ -214,15 +229,30 @@ def _fit_gyro(sets: list[_Set], names: str) -> tuple[list[Array], list[Array]]:
     if slow.any():
         raise BadInput(f"{names}: too little motion: hardly any turn about {_axes(slow)}; add a set that has some")
 
-    def residual(x: Array) -> Array:
-        constants = replace(DOCUMENTED, gyro_bias=x[:3], gyro_sensitivity=x[3:6])
-        return np.concatenate([one.turn_error(constants, o) for one, o in zip(sets, x[6:], strict=True)]).ravel()
+    def constants(x: Array) -> Calibration:
+        return replace(DOCUMENTED, gyro_bias=x[:3], gyro_sensitivity=x[3:6])
 
-    # The step in the offset is wide: over a narrow one the reference's noise would drown how its attitude changes.
-    steps = np.diag([0.01] * 3 + [0.1] * 3 + [0.02] * len(sets))
+    def residual(x: Array) -> Array:
+        errors = [one.turn_error(constants(x), offset) for one, offset in zip(sets, x[6:], strict=True)]
+        return np.concatenate(errors).ravel()
+
+    # The step in an offset is wide: over a narrow one the reference's noise would drown how its attitude changes.
+    steps, shift = np.repeat([0.01, 0.1], 3), 0.02
 
     def jacobian(x: Array) -> Array:
-        return np.stack([(residual(x + h) - residual(x - h)) / (2 * h.sum()) for h in steps], axis=1)
+        # By central differences, of which each works out anew only what it moves: the gyro's turn or the truth's.
+        rows = []
+        for i, (one, offset) in enumerate(zip(sets, x[6:], strict=True)):
+            J = np.zeros((one.begin.size, 3, len(x)))
+            true = one.true_turn(offset)
+            for column, h in enumerate(np.diag(steps)):
+                after, before = (_between(one.turned(constants(x[:6] + s * h)), true) for s in (1, -1))
+                J[..., column] = (after - before) / (2 * steps[column])
+            turned = one.turned(constants(x))
+            after, before = (_between(turned, one.true_turn(offset + s * shift)) for s in (1, -1))
+            J[..., 6 + i] = (after - before) / (2 * shift)
+            rows.append(J.reshape(-1, len(x)))
+        return np.concatenate(rows)
 
     start = np.concatenate([DOCUMENTED.gyro_bias, DOCUMENTED.gyro_sensitivity, np.zeros(len(sets))])
     x, errors = solve(residual, jacobian, start, np.repeat(by_second([one.begin for one in sets]), 3))
