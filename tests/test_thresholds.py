@@ -27,6 +27,11 @@ def walk(gate: float | None = None, noise: float = 0.3, seed: int = 7, duration:
     return collect(scenario, run(scenario), {"gate": gate, "range_noise": noise})
 
 
+@functools.cache
+def walked() -> evidence.Sequence:
+    return evidence.Sequence(walk())
+
+
 def case_of(white: Array, used: np.ndarray | None = None, gate: float | None = None) -> evidence.Case:
     """A run's case in which one sensor has these whitened innovations (N, m), S = 1 and R = 0.75."""
     N, m = white.shape
@@ -36,7 +41,7 @@ def case_of(white: Array, used: np.ndarray | None = None, gate: float | None = N
         np.ones(N, bool) if used is None else used,
     )  # fmt: skip
     recorded = replace(walk(), properties=walk().properties | {"params": {"gate": gate}})
-    return evidence.Case(recorded, {"range": readings}, evidence.Sequence(recorded))
+    return evidence.Case(recorded, {"range": readings}, walked())
 
 
 def severities(found: Any) -> list[tuple[str, str]]:
