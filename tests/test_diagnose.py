@@ -98,14 +98,14 @@ def next_of(filter: Any, space: Any, x: Array, tick: Tick, rng: np.random.Genera
 
 
 @functools.cache
-def healthy(name: str) -> list[Run]:
+def healthy(name: str, seeds: range = range(SEEDS // 2)) -> list[Run]:
     """By seed."""
     scenarios = []
-    for seed in range(SEEDS):
+    for seed in seeds:
         scenario = HEALTHY[name](np.random.default_rng(seed))
         scenario = replace(scenario, ticks=scenario.ticks[: STEPS.get(name)])
         scenarios.append(drawn(scenario, np.random.default_rng(1000 + seed)))
-    return together(scenarios, range(SEEDS))
+    return together(scenarios, seeds)
 
 
 def serious(findings: list[Finding]) -> list[Finding]:
@@ -114,7 +114,11 @@ def serious(findings: list[Finding]) -> list[Finding]:
 
 @pytest.mark.parametrize("name", HEALTHY)
 def test_data_of_the_filter_s_own_model_give_no_error_and_hardly_a_warning(name: str) -> None:
+    """Over ten seeds, and ten more after a warning: a fifth of runs that warn shows as none in ten in 11 %, as two in
+    twenty at most in 21 %."""
     found = [finding for run in healthy(name) for finding in serious(diagnose(run))]
+    if found:
+        found += [f for run in healthy(name, range(SEEDS // 2, SEEDS)) for f in serious(diagnose(run))]
     text = str(Counter((f.severity, f.code, f.sensor) for f in found))
     assert not [finding for finding in found if finding.severity == "error"], text
     assert len(found) <= SEEDS / 10, text
@@ -130,10 +134,10 @@ def test_an_approximate_scenario_raises_only_the_codes_that_it_states(name: str)
 
 @pytest.mark.long
 def test_the_gyro_s_freeze_is_found_in_the_real_sets(real_data: Path) -> None:
-    """In both side by side, as long as the shorter one is; what the loader has found of it is not told."""
+    """In the first half minute of both, side by side; what the loader has found of it is not told."""
     sets = [imu.imu([real_data / "ese650" / f"imuRaw{i}.mat"], np.random.default_rng(0)) for i in (1, 2)]
     scenarios = [imu.imu_ukf(one, initial="truth") for one in sets]
-    count = min(len(scenario.ticks) for scenario in scenarios)
+    count = int(np.searchsorted([tick.time for tick in scenarios[0].ticks], 30.0))
     cut = [
         replace(one, ticks=[replace(tick, faults={}) for tick in one.ticks[:count]], truth=one.truth[:count])
         for one in scenarios
@@ -264,7 +268,8 @@ def test_a_lag_is_measured(delay: float) -> None:
 
 
 def test_fault_scores_are_standard_normal_without_a_fault() -> None:
-    runs = list(map(evidence.case, healthy("landmarks-ekf")))
+    more = healthy("landmarks-ekf", range(SEEDS // 2, SEEDS))
+    runs = list(map(evidence.case, healthy("landmarks-ekf") + more))
     scores = [fault.score for case in runs for fault in signatures.faults(case)]
     assert len(scores) == 3 * SEEDS  # two biases and a lag each
     assert kstest(scores, "norm").pvalue > 0.01
