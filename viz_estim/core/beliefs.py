@@ -85,8 +85,10 @@ class Particles:
     def ess(self) -> Array:
         """The effective sample size 1/Σw² (*,), from 1 to N (Kong, Liu and Wong 1994)."""
         if self._ess is None:
-            # Not by BLAS: for many particles it wakes a thread on each core, which then waits there in a busy loop.
-            squares = np.einsum("...i,...i->...", self.weights, self.weights)
+            # Not by BLAS for many particles: it wakes a thread on each core, which then waits there in a busy loop.
+            weights = self.weights
+            few = weights.shape[-1] <= 10_000
+            squares = np.vecdot(weights, weights) if few else np.einsum("...i,...i->...", weights, weights)
             object.__setattr__(self, "_ess", np.asarray(1 / squares))
         assert self._ess is not None
         return self._ess

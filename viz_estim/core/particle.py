@@ -54,13 +54,13 @@ def weigh(belief: Particles, log_likelihood: LogLikelihood, tick: Tick, *, name:
         raise ArithmeticError("no particle has a likelihood above 0: none can give what was read")
     weights = log_weights - best
     np.exp(weights, out=weights)
-    total = np.add.reduce(weights, axis=-1)
-    evidence = best[..., 0] + np.log(total)
-    log_weights -= evidence[..., None]
+    total = np.add.reduce(weights, axis=-1, keepdims=True)
+    evidence = best + np.log(total)
+    log_weights -= evidence
     after = Particles(belief.space, belief.states, log_weights)
-    weights *= 1 / total[..., None]
+    weights /= total
     object.__setattr__(after, "_weights", weights)  # so that a resampling need not take exponentials again
-    return Weigh(name, after, log_likelihoods, np.asarray(evidence), after.ess)
+    return Weigh(name, after, log_likelihoods, evidence[..., 0], after.ess)
 
 
 @lru_cache(maxsize=8)
