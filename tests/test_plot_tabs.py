@@ -15,7 +15,13 @@ XYZ = ("x", "y", "z")
 
 def layout(space: Product, **known: Any) -> Any:
     """A layout of that state, with a truth and a gain, and nothing else unless it is said."""
-    nothing = {"labels": (), "stages": {"update": {"gain": {"shape": [2, 1]}}}, "sensors": {}, "matched": False}
+    nothing = {
+        "labels": (),
+        "stages": {"update": {"gain": {"shape": [2, 1]}}},
+        "sensors": {},
+        "inputs": {},
+        "matched": False,
+    }
     place = list(known.get("sensors", {})).index
     given = {"particles": 0, "duration": 9.0, "true_parts": list(space.parts), "place": place, "space": space}
     return SimpleNamespace(**nothing | given | {"ranges": Ranges()} | known)

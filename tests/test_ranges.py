@@ -51,6 +51,18 @@ def test_at_least_two_powers_of_ten_are_named_and_at_most_half_the_plot_is_empty
     assert named
 
 
+@pytest.mark.parametrize("bound", [2.2, 2.3, 2.4])
+def test_of_the_room_about_most_values_a_little_less_is_shown_where_a_small_window_then_names_numbers(
+    bound: float,
+) -> None:
+    values = np.full((3000, 2), [-1.7, 1.7])
+    values[:50] = -bound, bound
+    low, high = shown(values)
+    assert -bound <= low < -1.7
+    assert high > 2.3  # or the number 2 would be cut off
+    assert high - low < 4.6
+
+
 def test_nothing_and_a_constant_have_no_axis_of_their_own() -> None:
     ranges = Ranges()
     ranges.learn("constant", np.ones((9, 1)))

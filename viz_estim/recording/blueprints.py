@@ -23,7 +23,7 @@ def build(layout: Layout) -> rrb.Blueprint:
     shares: list[float] = {1: [1.0], 2: [2.1, 1.0], 3: [3.0, 1.9, 2.0]}[len(left)]
     if layout.camera:
         shares = [2.0, 2.2, 2.1]  # the unrolled sphere is twice as wide as high
-    low = plot_tabs.lanes_share(len(layout.inputs) + 1 + bool(layout.labels))
+    low = plot_tabs.lanes_share(plot_tabs.lanes_of(layout))
     whole = rrb.Horizontal(
         rrb.Vertical(*left, row_shares=shares),
         rrb.Vertical(plots, lanes, row_shares=[1 - low, low]),

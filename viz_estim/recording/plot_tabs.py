@@ -20,6 +20,8 @@ _READABLE = 3  # rows of plots in a tab: of more, the axes have room for no numb
 _MINUTE = 60.0  # s
 _SMALL = 652  # pixels that views have above one another in a window 720 high
 _LANE, _LANES_HEAD = 40, 48  # pixels of a lane with its name, and of what stands above all
+_TABS_HEAD, _PLOT_HEAD = 28, 45  # pixels of the tabs' names, and of what stands above and below a plot's axis
+_NAMED, _INSIDE = 20, 0.87  # pixels from which on a step of a power of ten is named; the axis without its edges
 # What the single numbers of our own stages mean, those first that say most.
 _OF_CLOUDS = {
     "evidence": "log-evidence of the reading",
@@ -55,6 +57,11 @@ def lanes(origin: str, name: str) -> rrb.StateTimelineView:
     return rrb.StateTimelineView(origin=origin, name=name, time_view=_whole_run())
 
 
+def lanes_of(layout: Layout) -> int:
+    """How many a run has: the stages, its inputs, and the truth of labels."""
+    return len(layout.inputs) + 1 + bool(layout.labels)
+
+
 def lanes_share(count: int) -> float:
     """The share of the height at which so many lanes are whole in a small window, up to half of it."""
     return min(0.5, (_LANES_HEAD + _LANE * count) / _SMALL)
@@ -87,8 +94,10 @@ def tabs(layout: Layout) -> list[_Item]:
 def _with_axes(tab: _Item, layout: Layout) -> _Item:
     """The same with the axes that were asked for, as high as the tab's rows are."""
     rows = len([*tab.contents]) if isinstance(tab, rrb.Container) else 1
+    height = (1 - lanes_share(lanes_of(layout))) * _SMALL - _TABS_HEAD
+    small = _INSIDE / _NAMED * (height / rows - _PLOT_HEAD)
     for view in _views(tab):
-        if axis := layout.ranges.asked(str(view.origin), rows):
+        if axis := layout.ranges.asked(str(view.origin), rows, small):
             view.properties["ScalarAxis"] = axis
     return tab
 

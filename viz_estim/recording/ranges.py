@@ -15,13 +15,15 @@ import rerun.blueprint as rrb
 from viz_estim.core.quaternions import Array
 
 _Range = tuple[float, float]
-_Find = Callable[[float], _Range | None]  # of how many steps of a power of ten are named
+# Of how many steps of a power of ten are named, and how many are in a small window.
+_Find = Callable[[float, float], _Range | None]
 _ASIDE = 0.02  # of the values at either end may be out of sight
 _CALM = 2.5  # all is shown where it is no more than this, by what most need
 _ROOM = 0.25  # of what most need, above and below it
 _KEPT = 4096  # rows of a plot, at most; more are thinned evenly
 _NUMBERS, _ROWS = 7.0, 3  # steps of a power of ten that are still named on a low plot, one of so many rows
 _EDGE = 0.03  # of the axis, beyond the last value
+_SMALLER = 0.58  # times as many are named in a window 720 high, with an edge, where four lanes stand below
 _HALF_A_NUMBER = 0.1  # of the axis of such a plot: a number nearer to its upper end is cut off
 
 
@@ -49,10 +51,13 @@ class Ranges:
         if path in self._seen:
             self._find[path] = partial(self._seen[path].range, calm)
 
-    def asked(self, path: str, rows: float = _ROWS) -> rrb.ScalarAxis | None:
-        """The axis that was asked for of a plot, one of so many rows: on a high plot more numbers are named. None where
-        nothing is known, or all is one value."""
-        found = self._find[path](_ROWS * _NUMBERS / rows) if self.fixed and path in self._find else None
+    def asked(self, path: str, rows: float = _ROWS, small: float | None = None) -> rrb.ScalarAxis | None:
+        """The axis that was asked for of a plot, one of so many rows: on a high plot more numbers are named. small: how
+        many steps are in a small window. None where nothing is known, or all is one value."""
+        if not self.fixed or path not in self._find:
+            return None
+        numbers = _ROWS * _NUMBERS / rows
+        found = self._find[path](numbers, small or _SMALLER * numbers)
         return rrb.ScalarAxis(range=found) if found else None
 
     def axis(self, path: str, calm: float = _CALM, rows: float = _ROWS) -> rrb.ScalarAxis | None:
@@ -106,7 +111,7 @@ class _Seen:
         while len(self._low) > _KEPT:
             self._low, self._high, self._stride = self._low[::2], self._high[::2], 2 * self._stride
 
-    def upward(self, top: float, numbers: float) -> _Range | None:
+    def upward(self, top: float, numbers: float, _small: float) -> _Range | None:
         self._take_in()
         if not len(self._high):
             return None
@@ -114,7 +119,7 @@ class _Seen:
         middle, most = np.partition(self._high, at)[at].tolist()  # with a level line each half of them is that line's
         return (0.0, top) if middle <= top else (0.0, readable(0.0, most, numbers)[1])
 
-    def range(self, calm: float, numbers: float) -> _Range | None:
+    def range(self, calm: float, numbers: float, small: float) -> _Range | None:
         self._take_in()
         if not len(self._low):
             return None
@@ -125,13 +130,26 @@ class _Seen:
         core = high - low
         if most - least > calm * core > 0:
             least, most = max(least, low - _ROOM * core), min(most, high + _ROOM * core)
-        return readable(least, most, numbers) if most - least > 1e-9 * max(abs(least), abs(most)) else None
+        if most - least <= 1e-9 * max(abs(least), abs(most)):
+            return None
+        # Less of the room about what most need, where then numbers are named in a small window too.
+        length = most - least
+        less = length - small * step_of(length, numbers)
+        if 0 < less < 0.9 * (length - core) and length < (1 + 2 * _ROOM + 1e-9) * core:
+            share = less / (length - core)
+            least, most = least + share * (low - least), most - share * (most - high)
+        return readable(least, most, numbers)
+
+
+def step_of(length: float, numbers: float) -> float:
+    """The least power of ten whose multiples are named on an axis of that length."""
+    return float(10.0 ** np.ceil(np.log10(length / numbers)))
 
 
 def readable(low: float, high: float, numbers: float = _NUMBERS) -> _Range:
     """The same range, made longer where fewer than two multiples of a power of ten would be named on it; numbers: so
     many steps of one are still named."""
-    step = 10.0 ** np.ceil(np.log10((high - low) / numbers))
+    step = step_of(high - low, numbers)
     above, below = (np.floor(high / step) + 1) * step, (np.ceil(low / step) - 1) * step
     while (above - below) / step < 2.5:  # they are the next ones outside
         if above - high <= 1.5 * (low - below):  # about as far: upwards, as in the plots beside it
