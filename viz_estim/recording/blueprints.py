@@ -46,7 +46,7 @@ def legend(layout: Layout) -> str:
         what = "the moved cloud and its pose" if layout.matched else "the estimate"
         said = f"amber is {what}{truth}, grey lines its bounds"
         if layout.particles:
-            said += ", yellow each of several modes"
+            said += ", yellow each of several modes; particles are blue where they are light, amber where heavy"
         if layout.matched:
             said += ", grey points the fixed cloud"
         elif layout.attitude:
@@ -86,13 +86,13 @@ def _scenes(layout: Layout) -> list[_Item]:
         ))  # fmt: skip
     if layout.position:
         assert layout.extent
-        kind = f"{'Plan' if layout.planar else 'World'}, grid {eyes.spacing(layout.extent[1]):g} m"
-        title = f"estimate amber with 3σ{truth}, before the update grey"
+        # Of more than 64 letters the last are out of sight where a window is 1280 wide.
+        title = f"estimate amber with 3σ, prior grey{truth}"
         if layout.particles:
-            title = f"particles blue (light) to amber (heavy), modes yellow{truth}"
+            title = f"weight blue to amber, modes yellow{truth}"
         elif layout.matched:
-            title = "moved cloud amber, fixed grey, pairs blue (near) to red (far)"
-        first.append(_world(layout, f"{kind}: {title}"))
+            title = "moved amber, fixed grey, pairs blue (near) to red"
+        first.append(_world(layout, f"{eyes.spacing(layout.extent[1]):g} m grid: {title}"))
     second: list[_Item] = [*pictures.views(layout)]
     if layout.attitude and not layout.matched:
         title = f"Attitude: estimate amber{truth}{', sigma points on the sphere' if points else ''}"
