@@ -9,6 +9,7 @@ from rerun.blueprint.encodings import TextLogColumn, TextLogColumnKind
 from viz_estim.core.consistency import band
 from viz_estim.recording import links, plot_tabs, schema
 from viz_estim.recording.compared import Alone, is_figure
+from viz_estim.recording.figure_names import figure_names, figures_once
 from viz_estim.recording.layout import as_product
 from viz_estim.recording.lines import shown
 from viz_estim.recording.pictures import CANVAS
@@ -138,9 +139,9 @@ def _figures(alone: Alone) -> list[_Plots]:
     groups = [
         [
             graph("figure", f"{stage}.{name}", f"{stage}: {words}")
-            for name, words in plot_tabs.figure_names(numbers, fit=_registered(alone), particles=particles).items()
+            for name, words in figure_names(numbers, fit=_registered(alone), particles=particles).items()
         ]
-        for stage, numbers in plot_tabs.figures_once(by_stage).items()
+        for stage, numbers in figures_once(by_stage).items()
     ]
     return [group for group in groups if group]
 

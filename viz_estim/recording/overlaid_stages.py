@@ -10,8 +10,8 @@ from viz_estim.core.quaternions import Array
 from viz_estim.core.spaces import Product
 from viz_estim.recording.columns import Times
 from viz_estim.recording.compared import Compared, is_figure
+from viz_estim.recording.figure_names import figure_names, figures_once
 from viz_estim.recording.layout import as_product
-from viz_estim.recording.plot_tabs import figure_names, figures_once
 from viz_estim.recording.reader import Run
 from viz_estim.recording.sheet import Sheet, titled
 from viz_estim.recording.tables import StageTable

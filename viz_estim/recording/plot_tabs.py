@@ -12,6 +12,7 @@ from viz_estim.core.consistency import band
 from viz_estim.core.descriptions import describe
 from viz_estim.core.spaces import Euclidean, Space
 from viz_estim.recording import schema
+from viz_estim.recording.figure_names import COUNTED, figure_names, figures_once
 from viz_estim.recording.layout import Layout
 from viz_estim.recording.lines import sigma_plots
 
@@ -22,34 +23,8 @@ _SMALL = 652  # pixels that views have above one another in a window 720 high
 _LANE, _LANES_HEAD = 40, 48  # pixels of a lane with its name, and of what stands above all
 _TABS_HEAD, _PLOT_HEAD = 28, 45  # pixels of the tabs' names, and of what stands above and below a plot's axis
 _NAMED, _INSIDE = 20, 0.87  # pixels from which on a step of a power of ten is named; the axis without its edges
-# What the single numbers of our own stages mean, those first that say most.
-_OF_CLOUDS = {
-    "evidence": "log-evidence of the reading",
-    "ess": "effective sample size before resampling",
-    "distinct": "distinct ancestors",
-}
-_OF_FITS = {"rmse": "RMSE [m]", "count": "matches", "converged": "settled (0 or 1)"}
-_COUNTED = ("ess", "distinct")  # of all particles
 _TOPS = {"converged": 1}
 _ERRORS = 3  # in a row, of parts of one or two axes
-
-
-def figure_names(fields: list[str], *, fit: bool, particles: int | None) -> dict[str, str]:
-    """By field, what a stage's single numbers mean; a person's own are called as they call them. fit: the run is a
-    registration; particles: how many there are, None where there are none, 0 where that differs."""
-    known = _OF_FITS if fit else {} if particles is None else _OF_CLOUDS
-    fields = sorted(fields, key=lambda field: list(known).index(field) if field in known else len(known))
-    return {f: known.get(f, f) + (f", of {particles}" if particles and f in _COUNTED else "") for f in fields}
-
-
-def figures_once(stages: dict[str, list[str]]) -> dict[str, list[str]]:
-    """By stage the single numbers to show: of a resampling not the effective sample size that it found, where the
-    weighing before it has told the same."""
-    weighed = any("ess" in fields and "distinct" not in fields for fields in stages.values())
-    return {
-        stage: [f for f in fields if not (weighed and f == "ess" and "distinct" in fields)]
-        for stage, fields in stages.items()
-    }
 
 
 def lanes(origin: str, name: str) -> rrb.StateTimelineView:
@@ -171,7 +146,7 @@ def _figures(layout: Layout) -> list[_Item]:
     for stage, numbers in figures_once(by_stage).items():
         named = figure_names(numbers, fit=layout.matched, particles=layout.particles or None)
         for field, words in named.items():
-            top = _TOPS.get(field) if layout.matched else layout.particles if field in _COUNTED else None
+            top = _TOPS.get(field) if layout.matched else layout.particles if field in COUNTED else None
             axis = rrb.ScalarAxis(range=(-0.03 * top, 1.03 * top)) if top else None
             views.append(_framed(layout, "figure", f"{stage}.{field}", f"{stage}: {words}", axis))
     across = -(-len(views) // _READABLE)
