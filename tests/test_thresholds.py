@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from viz_estim.core.distributions import chi2
 from viz_estim.core.modes import modes
 from viz_estim.core.quaternions import Array
 from viz_estim.core.run import run
@@ -92,8 +93,6 @@ def test_judge_takes_the_p_of_a_large_effect_or_says_that_it_is() -> None:
 
 
 def passed_by(white: Array, g: float) -> np.ndarray:
-    from scipy.stats import chi2
-
     return np.asarray((white**2).sum(1) <= chi2.ppf(g, white.shape[1]))
 
 
