@@ -77,7 +77,7 @@ class Recorder:
         self._lock, self._writing = threading.Lock(), threading.Lock()  # of the batches, and of the file
         self._failed: Exception | None = None
         self._closed = threading.Event()
-        self._sent = threading.Event()  # a batch waits to be written
+        self._sent = threading.Event()  # a batch waits to be written by the other thread
         name = str(properties.get("scenario", path.stem))
         # A view belongs to an application id: runs of one scenario share what a person arranges in the viewer.
         plain = re.sub(r"[^A-Za-z0-9_-]+", "-", name)  # Rerun renames others, and says so
@@ -124,10 +124,11 @@ class Recorder:
             full = len(self._rows) >= self._limit or now - self._oldest >= 0.9 * self._patience
             if full:
                 self._take()
-        if full:
-            if not self._beside or len(self._full) > _BEHIND:
-                self._write()
+        if full and self._beside and len(self._full) <= _BEHIND:
             self._sent.set()
+        elif full:
+            self._write()
+            self._stream.flush(timeout_sec=0)  # begun and not waited for; to wake the other thread for it costs more
 
     def _size_batches(self, size: int) -> None:
         """Settles, from a step of so many bytes, how many make a batch, and who writes it."""
